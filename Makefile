@@ -1,0 +1,32 @@
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test check lock clean
+
+demo: .venv/installed
+	$(BIN)/distrace demo --out out/demo
+
+test: .venv/installed
+	$(BIN)/python -m pytest -n 2
+
+check: .venv/installed  ## style and types
+	$(BIN)/ruff check src tests examples
+	$(BIN)/ruff format --check src tests examples
+	$(BIN)/pyright
+
+# The environment; made again only when what it is made from changes.
+.venv/installed: requirements.lock pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --requirement requirements.lock
+	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation --editable .
+	touch $@
+
+# torch pins the CUDA libraries it brings where it can use them; the lock leaves them to it.
+lock:
+	echo torch==2.13.0 > .torch-pin
+	$(BIN)/python -m uv pip compile pyproject.toml --extra dev --universal --python-version 3.10 --quiet --no-annotate --no-header \
+	    --constraint .torch-pin | grep -vE '^(nvidia|cuda|triton)' > requirements.lock
+	rm .torch-pin
+
+clean:
+	rm -rf .venv out

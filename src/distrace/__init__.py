@@ -1,0 +1,23 @@
+"""A differentiable renderer for neural signed distance functions, by sphere tracing."""
+
+from distrace.camera import Camera as Camera
+from distrace.checkpoint import Model as Model
+from distrace.checkpoint import load_model as load_model
+from distrace.field import SDF as SDF
+from distrace.field import chunked as chunked
+from distrace.field import placed as placed
+from distrace.mesh import MeshConfig as MeshConfig
+from distrace.mesh import extract_mesh as extract_mesh
+from distrace.metrics import chamfer as chamfer
+from distrace.rays import Bounds as Bounds
+from distrace.rays import Rays as Rays
+from distrace.rays import meet_sphere as meet_sphere
+from distrace.render import Buffers as Buffers
+from distrace.render import render as render
+from distrace.surface import attach as attach
+from distrace.surface import clearance as clearance
+from distrace.surface import normals as normals
+from distrace.trace import Outcome as Outcome
+from distrace.trace import Trace as Trace
+from distrace.trace import TraceConfig as TraceConfig
+from distrace.trace import sphere_trace as sphere_trace

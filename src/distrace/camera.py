@@ -1,0 +1,162 @@
+"""Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5, `T_world_camera`."""
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.rays import Rays
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics in pixels and the pose that maps camera to world; both may have batch axes and may require grad."""
+
+    intrinsics: Float[Tensor, "*batch 3 3"]
+    T_world_camera: Float[Tensor, "*batch 4 4"]
+    height: int
+    width: int
+
+    @staticmethod
+    def from_matrices(intrinsics: Tensor, T_world_camera: Tensor, height: int, width: int) -> "Camera":
+        """A camera from its two matrices; raises `ValueError` where they are not a camera's."""
+        if intrinsics.shape[-2:] != (3, 3) or T_world_camera.shape[-2:] != (4, 4):
+            given = f"{list(intrinsics.shape)} and {list(T_world_camera.shape)}"
+            raise ValueError(f"matrices of shapes {given} were given; intrinsics are [3, 3] and T_world_camera is [4, 4]")
+        if height < 1 or width < 1:
+            raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be at least 1")
+        _check_values(intrinsics, T_world_camera)
+        return Camera(intrinsics, T_world_camera, height, width)
+
+    @staticmethod
+    def look_at(
+        eye: Float[Tensor, "3"],
+        target: Float[Tensor, "3"],
+        *,
+        height: int = 512,
+        width: int = 512,
+        focal_mm: float = 60.0,
+        sensor_mm: float = 32.0,
+        focal_px: float | None = None,
+    ) -> "Camera":
+        """A camera at `eye` that sees `target` in its middle and y pointing up.
+
+        The focal length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the eye
+        is at the target, or a length is not positive.
+        """
+        focal = width * focal_mm / sensor_mm if focal_px is None and sensor_mm > 0 else (focal_px or 0.0)
+        if not (focal > 0 and math.isfinite(focal)):
+            raise ValueError(
+                f"a focal length of {focal_px or focal_mm} on a sensor of {sensor_mm} was given; both must be positive"
+            )
+        forward = target - eye
+        if not forward.norm() > 0:
+            raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
+        forward = forward / forward.norm()
+        up = forward.new_tensor([0.0, 1.0, 0.0] if forward[1].abs() < 1 - 1e-6 else [0.0, 0.0, 1.0])
+        right = torch.linalg.cross(forward, up)
+        right = right / right.norm()
+        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
+        pose = torch.eye(4, dtype=eye.dtype)
+        pose[:3, :3], pose[:3, 3] = rotation, eye
+        intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=eye.dtype)
+        return Camera.from_matrices(intrinsics, pose, height, width)
+
+    @staticmethod
+    def orbit(
+        azimuth: float,
+        elevation: float,
+        distance: float,
+        *,
+        height: int = 512,
+        width: int = 512,
+        focal_mm: float = 60.0,
+        sensor_mm: float = 32.0,
+        focal_px: float | None = None,
+        dtype: torch.dtype = torch.float32,
+    ) -> "Camera":
+        """A camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el), in degrees."""
+        az, el = math.radians(azimuth), math.radians(elevation)
+        eye = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
+        return Camera.look_at(
+            torch.tensor(eye, dtype=dtype) * distance,
+            torch.zeros(3, dtype=dtype),
+            height=height,
+            width=width,
+            focal_mm=focal_mm,
+            sensor_mm=sensor_mm,
+            focal_px=focal_px,
+        )
+
+    def pixels(self) -> Float[Tensor, "height width 2"]:
+        """The centres (x, y) of all pixels."""
+        like = self.intrinsics
+        y = torch.arange(self.height, dtype=like.dtype, device=like.device) + 0.5
+        x = torch.arange(self.width, dtype=like.dtype, device=like.device) + 0.5
+        return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
+
+    def rays(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Rays:
+        """The rays through pixel positions, by default all centres: [*batch, height, width]."""
+        pixels = self.pixels() if pixels is None else pixels
+        batch, axes = self.intrinsics.shape[:-2], (1,) * (pixels.dim() - 1)
+        rotation = self.T_world_camera[..., :3, :3].reshape(*batch, *axes, 3, 3)
+        ahead = self._ahead(pixels)
+        directions = (rotation @ (ahead / ahead.norm(dim=-1, keepdim=True))[..., None])[..., 0]
+        origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
+        return Rays(origins, directions)
+
+    def project(self, points_world: Float[Tensor, "*points 3"]) -> tuple[Tensor, Tensor]:
+        """Pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""
+        rotation, centre = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        points_camera = (points_world - centre) @ rotation
+        image = points_camera @ self.intrinsics.T
+        return image[..., :2] / image[..., 2:], points_camera[..., 2]
+
+    def depth(self, distance: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
+        """Depth z of what lies at a distance along each pixel's ray."""
+        return distance * self.cosines()
+
+    def cosines(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
+        """Of the angle between each pixel's ray and the optical axis: depth over distance."""
+        return 1 / self._ahead(self.pixels() if pixels is None else pixels).norm(dim=-1)
+
+    def tolerance(self, least_depth: float) -> Float[Tensor, "*batch height width"]:
+        """DIST's convergence criterion: half the distance of what neighbouring pixels see at the least depth.
+
+        ε = d · cos²θ / (2 f), f in pixels (Liu et al., CVPR 2020, section 3.2).
+        """
+        focal = self.intrinsics[..., 0, 0].reshape(*self.intrinsics.shape[:-2], 1, 1)
+        return least_depth * self.cosines() ** 2 / (2 * focal)
+
+    def resized(self, factor: float) -> "Camera":
+        """The same camera with a coarser or finer sensor; sizes are rounded up, so that every pixel stays covered."""
+        scale = self.intrinsics.new_tensor([[factor], [factor], [1.0]])
+        size = math.ceil(self.height * factor), math.ceil(self.width * factor)
+        return replace(self, intrinsics=self.intrinsics * scale, height=size[0], width=size[1])
+
+    def to(self, device: torch.device | str) -> "Camera":
+        return replace(self, intrinsics=self.intrinsics.to(device), T_world_camera=self.T_world_camera.to(device))
+
+    def _ahead(self, pixels: Tensor) -> Float[Tensor, "*batch_pixels 3"]:
+        """Points at depth 1 seen by pixels, in the camera's axes."""
+        axes = (1,) * (pixels.dim() - 1)
+        inverse = torch.linalg.inv(self.intrinsics).reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
+        homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
+        return (inverse @ homogeneous[..., None])[..., 0]
+
+
+def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:
+    if not (intrinsics.isfinite().all() and T_world_camera.isfinite().all()):
+        raise ValueError("the camera's matrices hold values that are not finite")
+    focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
+    if not (focal > 0).all():
+        raise ValueError(f"focal lengths of {focal.tolist()} pixels were given; they must be positive")
+    rotation = T_world_camera.detach()[..., :3, :3].double()
+    error = (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+    if error > 1e-3 or (torch.linalg.det(rotation) < 0).any():
+        raise ValueError(
+            f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right, y down,"
+            " z forward) to the world, without scale or mirroring"
+        )

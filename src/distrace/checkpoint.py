@@ -1,0 +1,195 @@
+"""Models on disk: DeepSDF's experiment folders, in every dialect that writers of them have used, and the bundled ones.
+
+A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and `LatentCodes/NAME.pth`
+(DeepSDF's). Nothing in a file is ever run.
+"""
+
+import json
+import re
+from dataclasses import asdict, dataclass
+from importlib.resources import files
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.errors import explained
+from distrace.field import SDF
+from distrace.files import written
+
+LATEST = "latest.pth"
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained decoder and the codes of the shapes it was trained on. Its weights are frozen: `requires_grad_()` thaws."""
+
+    name: str
+    decoder: Decoder
+    codes: Float[Tensor, "shapes length"]
+    shapes: tuple[str, ...]
+
+    def field(self, code: int | Float[Tensor, "length"]) -> SDF:
+        """The signed distance field of a training code, or of any code.
+
+        Raises `ValueError` for a number or a length that the model has not.
+        """
+        if isinstance(code, Tensor):
+            return self.decoder.field(code)
+        if not 0 <= code < len(self.codes):
+            raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
+        return self.decoder.field(self.codes[code])
+
+    def to(self, device: torch.device | str) -> "Model":
+        return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
+
+
+def bundled_models() -> list[str]:
+    """The names that `load_model` knows without a folder."""
+    return sorted(folder.name for folder in (files("distrace") / "models").iterdir() if folder.is_dir())
+
+
+def load_model(name: str | Path) -> Model:
+    """A bundled model by name, or any DeepSDF experiment folder.
+
+    Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
+    """
+    if str(name) in bundled_models():
+        folder = Path(str(files("distrace") / "models" / str(name)))
+    else:
+        folder = Path(name)
+    if not folder.is_dir():
+        raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
+    specs, shapes = _read_specs(folder)
+    ours = folder / "model.safetensors"
+    source, state, codes = _read_safetensors(ours) if ours.exists() else _read_deepsdf(folder)
+    decoder = _filled(Decoder(specs), state, source)
+    if codes.shape[1] != specs.code_length:
+        raise ValueError(f"{folder} has codes of {codes.shape[1]} numbers, but specs.json says {specs.code_length}")
+    if not codes.isfinite().all():
+        raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
+    names = shapes if len(shapes) == len(codes) else tuple(str(number) for number in range(len(codes)))
+    return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
+
+
+def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
+    """Writes our own, smaller form: weight norm multiplied out, in half precision."""
+    specs = model.decoder.specs
+    tensors = {"codes": model.codes.to(dtype).contiguous()}
+    for layer in range(model.decoder.depth):
+        linear = getattr(model.decoder, f"lin{layer}")
+        tensors |= {f"lin{layer}.weight": linear.weight, f"lin{layer}.bias": linear.bias}
+    plain = NetworkSpecs(**{**asdict(specs), "norm_layers": (), "weight_norm": False})
+    _write_specs(folder, plain, model.shapes)
+    with written(folder / "model.safetensors") as file:
+        file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
+
+
+def save_experiment(folder: Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
+    """Writes DeepSDF's own layout, with the key names that its original code reads."""
+    state = {_classic(key): value.detach().cpu() for key, value in decoder.state_dict().items()}
+    _write_specs(folder, decoder.specs, shapes)
+    with written(folder / "ModelParameters" / LATEST) as file:
+        torch.save({"epoch": 0, "model_state_dict": state}, file)
+    with written(folder / "LatentCodes" / LATEST) as file:
+        torch.save({"epoch": 0, "latent_codes": {"weight": codes.detach().cpu()}}, file)
+
+
+def _classic(key: str) -> str:
+    key = key.replace("parametrizations.weight.original0", "weight_g")
+    return "module." + key.replace("parametrizations.weight.original1", "weight_v")
+
+
+def _modern(key: str) -> str:
+    key = key.removeprefix("module.")
+    key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
+    return re.sub(r"weight_v$", "parametrizations.weight.original1", key)
+
+
+def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> None:
+    network = asdict(specs)
+    length = network.pop("code_length")
+    content = {"NetworkArch": "deep_sdf_decoder", "NetworkSpecs": network, "CodeLength": length, "Shapes": shapes}
+    with written(folder / "specs.json") as file:
+        file.write(json.dumps(content, indent=1).encode())
+
+
+def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
+    path = folder / "specs.json"
+    if not path.is_file():
+        raise ValueError(f"{folder} has no specs.json, which names the network's layers; it is not a DeepSDF experiment")
+    with explained(f"{path} is not a DeepSDF specification"):
+        content = json.loads(path.read_text())
+        network = content["NetworkSpecs"]
+        specs = NetworkSpecs(
+            dims=tuple(int(width) for width in network["dims"]),
+            code_length=int(content["CodeLength"]),
+            latent_in=tuple(network.get("latent_in") or ()),
+            norm_layers=tuple(network.get("norm_layers") or ()),
+            weight_norm=bool(network.get("weight_norm", False)),
+            xyz_in_all=bool(network.get("xyz_in_all", False)),
+            use_tanh=bool(network.get("use_tanh", False)),
+            dropout=tuple(network.get("dropout") or ()),
+            dropout_prob=float(network.get("dropout_prob") or 0.0),
+        )
+        shapes = tuple(str(shape) for shape in content.get("Shapes", ()))
+    architecture = content.get("NetworkArch", "deep_sdf_decoder")
+    if architecture != "deep_sdf_decoder" or network.get("geom_dimension", 3) != 3:
+        raise ValueError(f"{path} describes the network {architecture}; only deep_sdf_decoder of 3-D points can be read")
+    return specs, shapes
+
+
+def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
+    with explained(f"{path} is not a safetensors file of a model"):
+        tensors = {key: tensor.float() for key, tensor in safetensors.torch.load_file(path).items()}
+        codes = tensors.pop("codes")
+    return path, tensors, codes
+
+
+def _read_deepsdf(folder: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
+    weights = _checkpoint(folder / "ModelParameters")
+    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict"):
+        content = torch.load(weights, map_location="cpu", weights_only=True)
+        state = {_modern(key): tensor.float() for key, tensor in content["model_state_dict"].items()}
+    latent = folder / "LatentCodes" / weights.name
+    if not latent.is_file():
+        raise ValueError(f"{latent} is missing: the codes that belong to {weights.name} of ModelParameters")
+    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes"):
+        codes = _codes(torch.load(latent, map_location="cpu", weights_only=True)["latent_codes"])
+    return weights, state, codes
+
+
+def _checkpoint(folder: Path) -> Path:
+    """`latest.pth`, or else the one of the most epochs."""
+    found = sorted(folder.glob("*.pth"), key=lambda path: (path.stem.isdigit(), int(path.stem) if path.stem.isdigit() else 0))
+    if not found:
+        raise ValueError(f"{folder} holds no checkpoint; {LATEST} or one named by its epoch (2000.pth) is looked for")
+    return folder / LATEST if (folder / LATEST) in found else found[-1]
+
+
+def _codes(stored: Tensor | dict[str, Tensor] | list[Tensor]) -> Float[Tensor, "shapes length"]:
+    if isinstance(stored, dict):
+        stored = stored["weight"]
+    if isinstance(stored, list):
+        stored = torch.stack([code.reshape(-1) for code in stored])
+    return stored.detach().float().reshape(len(stored), -1)
+
+
+def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
+    """The decoder with the weights put in, after a look at each: their names, shapes and values."""
+    expected = decoder.state_dict()
+    for key in expected.keys() | state.keys():
+        if key not in state:
+            raise ValueError(f"{source} lacks {key}, which specs.json calls for")
+        if key not in expected:
+            raise ValueError(f"{source} has {key}, for which specs.json has no place")
+        if state[key].shape != expected[key].shape:
+            given, wanted = list(state[key].shape), list(expected[key].shape)
+            raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
+        if not state[key].isfinite().all():
+            raise ValueError(f"{source}: {key} has values that are not finite; the training that wrote it has diverged")
+    decoder.load_state_dict(state)
+    return decoder

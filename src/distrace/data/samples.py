@@ -1,0 +1,70 @@
+"""Signed samples of a solid, in DeepSDF's distribution and file layout (Park et al., CVPR 2019, section 3)."""
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+from distrace.data.solid import Solid
+from distrace.files import written
+
+NEAR = 0.94  # the share of samples near the surface; the rest fills the unit sphere
+VARIANCES = (0.0025, 0.00025)
+DOUBTFUL = 0.25  # a winding number this far from a whole number leaves the sign in doubt
+HOPELESS = 0.02  # a shape with a larger share of doubtful signs is not learnt
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """How far a shape's signs can be trusted."""
+
+    name: str
+    faces: int
+    outer_area: float  # share of the faces' area that bounds the solid
+    doubtful: float  # share of samples whose winding number is far from a whole number
+    usable: bool
+    reason: str = ""  # why it is left out
+
+
+def sample(solid: Solid, count: int, seed: int) -> Float[np.ndarray, "count 4"]:
+    """Points and signed distances: most are surface points displaced by Gaussian noise, the rest fill the unit sphere."""
+    random = np.random.default_rng(seed)
+    near = int(NEAR * count) // 2
+    surface, _ = trimesh.sample.sample_surface(solid.surface, near, seed=seed)
+    displaced = [surface + random.normal(size=surface.shape) * variance**0.5 for variance in VARIANCES]
+    direction = random.normal(size=(count - 2 * near, 3))
+    radius = random.random((len(direction), 1)) ** (1 / 3)
+    points = np.concatenate([*displaced, direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius])
+    return np.column_stack([points, solid.distance(points)]).astype(np.float32)
+
+
+def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
+    """A report on a shape's signs, at points in and around it."""
+    points = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * np.abs(solid.soup.bounds).max(0) * 1.05
+    winding = solid.winding(points)
+    doubtful = float((np.abs(winding - np.round(winding)) > DOUBTFUL).mean())
+    outer = float(solid.surface.area / solid.soup.area)
+    usable = doubtful <= HOPELESS
+    reason = "" if usable else f"{doubtful:.1%} of its signs are doubtful"
+    return Doubt(name, len(solid.soup.faces), outer, doubtful, usable, reason)
+
+
+def lopsided(solid: Solid, count: int = 2000) -> bool:
+    """Whether the mirror image in x is another shape."""
+    points, _ = trimesh.sample.sample_surface(solid.surface, count, seed=0)
+    return bool(np.mean(solid.distance(points * (-1, 1, 1)) ** 2) > 2e-5)
+
+
+def write_samples(path: Path, samples: Float[np.ndarray, "n 4"]) -> None:
+    """DeepSDF's `.npz`, with `pos` and `neg` [n, 4]: what lies outside and what lies inside."""
+    inside = samples[:, 3] < 0
+    with written(path) as part:
+        np.savez(part, pos=samples[~inside], neg=samples[inside])
+
+
+def write_report(path: Path, report: Doubt) -> None:
+    with written(path) as part:
+        part.write(json.dumps(asdict(report), indent=1).encode())

@@ -1,0 +1,86 @@
+"""Sampling a folder of meshes: in parallel, going on where it was stopped."""
+
+import json
+import zlib
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+
+import numpy as np
+
+from distrace.data.samples import Doubt, doubt, lopsided, sample, write_report, write_samples
+from distrace.data.solid import Solid, load_solid, stretched, turned
+from distrace.data.split import Shape
+
+STRETCH = 0.2  # each axis of a stretched variant is scaled by up to e to this
+
+
+@dataclass(frozen=True)
+class Job:
+    """One shape to sample, with its variants."""
+
+    shape: Shape
+    mesh: Path
+    out: Path
+    count: int
+    mirror: bool = False  # also its mirror image in x, where that is another shape
+    stretches: int = 0  # also as many copies stretched at random
+
+    def samples(self, variant: str = "") -> Path:
+        return self.out / f"{self.shape.name}{variant}.npz"
+
+
+def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, stretches: int) -> list[Job]:
+    """The shapes to sample; only those to train on have variants."""
+    variants = {"train": (mirror, stretches)}
+    return [
+        Job(shape, meshes / shape.path, out, count, *variants.get(shape.split, (False, 0))) for shape in shapes
+    ]
+
+
+def run(todo: list[Job], workers: int) -> Iterator[Doubt]:
+    """Does the jobs and yields their reports, those of an earlier run first."""
+    reports = [_earlier(job) for job in todo]
+    yield from (report for report in reports if report)
+    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
+        pending = [pool.submit(run_one, job) for job, report in zip(todo, reports) if not report]
+        try:
+            yield from (future.result() for future in as_completed(pending))
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def run_one(job: Job) -> Doubt:
+    """Writes the samples of a shape and its variants, and last its report.
+
+    A mesh that cannot be read, or whose signs are beyond hope, has a report that says why, and no samples.
+    """
+    try:
+        solid = turned(load_solid(job.mesh), job.shape.turn)
+    except ValueError as error:
+        report = Doubt(job.shape.name, 0, 0.0, 1.0, False, str(error))
+    else:
+        report = doubt(job.shape.name, solid)
+        if report.usable:
+            _write(job, solid)
+    write_report(job.samples().with_suffix(".json"), report)
+    return report
+
+
+def _write(job: Job, solid: Solid) -> None:
+    seed = zlib.crc32(job.shape.name.encode())
+    samples = sample(solid, job.count, seed)
+    write_samples(job.samples(), samples)
+    if job.mirror and lopsided(solid):
+        write_samples(job.samples("~mirrored"), samples * np.float32([-1, 1, 1, 1]))
+    random = np.random.default_rng(seed)
+    for number in range(1, job.stretches + 1):
+        factors = np.exp(random.uniform(-STRETCH, STRETCH, 3)) * (random.choice([-1, 1]), 1, 1)
+        write_samples(job.samples(f"~stretched{number}"), sample(stretched(solid, factors), job.count, seed + number))
+
+
+def _earlier(job: Job) -> Doubt | None:
+    path = job.samples().with_suffix(".json")
+    return Doubt(**json.loads(path.read_text())) if path.exists() else None

@@ -1,0 +1,52 @@
+"""What a surface is: a callable from points to signed distances, and wrappers that turn one field into another."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
+"""Signed distance at points of the unit sphere: positive outside, negative inside, the surface where it is zero."""
+
+
+def value_and_gradient(
+    sdf: SDF, points: Float[Tensor, "*batch 3"], *, second_order: bool = True
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
+    """The field's value and its gradient ∇f at each point, from one evaluation.
+
+    Where grad mode is on both are differentiable; without `second_order` the gradient is a constant, at half the cost.
+    """
+    keep_graph = torch.is_grad_enabled()
+    with torch.enable_grad():
+        points = points if points.requires_grad else points.detach().requires_grad_()
+        value = sdf(points)
+        twice = keep_graph and second_order
+        (gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=keep_graph, create_graph=twice)
+    return value if keep_graph else value.detach(), gradient
+
+
+def chunked(sdf: SDF, size: int) -> SDF:
+    """The same field, evaluated at most `size` points at a time: a bound on memory, and on a CPU faster."""
+
+    def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        flat = points.reshape(-1, 3)
+        if len(flat) <= size:
+            return sdf(points)
+        return torch.cat([sdf(part) for part in flat.split(size)]).reshape(points.shape[:-1])
+
+    return field
+
+
+def placed(sdf: SDF, T_world_object: Float[Tensor, "4 4"]) -> SDF:
+    """The field of an object moved into the world by a similarity (rotation · scale, translation).
+
+    Distances are scaled with the object, so the result is a signed distance again.
+    """
+    linear, translation = T_world_object[:3, :3], T_world_object[:3, 3]
+    scale = torch.linalg.det(linear) ** (1 / 3)
+
+    def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return scale * sdf((points - translation) @ torch.linalg.inv(linear).T)
+
+    return field

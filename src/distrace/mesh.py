@@ -1,0 +1,79 @@
+"""The surface of a field as triangles."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float, Int
+from skimage.measure import marching_cubes
+from torch import Tensor
+
+from distrace.field import SDF
+
+LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
+
+
+@dataclass(frozen=True)
+class MeshConfig:
+    """A grid of `resolution` cells (a multiple of 8) along each axis of the cube of half width `radius`."""
+
+    resolution: int = 256
+    radius: float = 1.0
+    steepest: float = 1.5  # a bound on |∇f|: a cell farther from zero than this over half its diagonal is passed over
+    device: torch.device = torch.device("cpu")
+
+    def __post_init__(self) -> None:
+        if self.resolution < 8 or self.resolution % 2**LEVELS:
+            raise ValueError(f"a resolution of {self.resolution} was given; it must be a multiple of 8")
+
+
+@torch.no_grad()
+def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh:
+    """Marching cubes (Lorensen and Cline, SIGGRAPH 1987) on the cells of a grid that can hold the surface.
+
+    Normals point out. Raises `ValueError` where the field has no zero in the cube.
+    """
+    width = 2 * config.radius / config.resolution
+    corners = _corners(_cells_at_surface(sdf, config))
+    values = sdf(corners.float() * width - config.radius).cpu().numpy()
+    if not (values.min() < 0 < values.max()):
+        raise ValueError(f"the field has no zero within {config.radius} of the origin: there is no surface to extract")
+    grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
+    grid[tuple(corners.cpu().numpy().T)] = values
+    known = np.isfinite(grid)
+    vertices, faces, _, _ = marching_cubes(np.where(known, grid, 1.0), 0.0, mask=_whole_cells(known))
+    return trimesh.Trimesh(vertices * width - config.radius, faces, process=False)
+
+
+def _cells_at_surface(sdf: SDF, config: MeshConfig) -> Int[Tensor, "n 3"]:
+    """Indices of the finest cells, found by halving those of a coarse grid that |f| at the centre cannot exclude."""
+    coarse = torch.arange(config.resolution >> LEVELS, device=config.device)
+    cells, halves = torch.cartesian_prod(coarse, coarse, coarse), _offsets(config.device)
+    for level in range(LEVELS, 0, -1):
+        width = 2 * config.radius / config.resolution * 2**level
+        near = sdf((cells + 0.5) * width - config.radius).abs() <= config.steepest * width * 3**0.5 / 2
+        cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
+    return cells
+
+
+def _corners(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "m 3"]:
+    return torch.unique((cells[:, None] + _offsets(cells.device)).reshape(-1, 3), dim=0)
+
+
+def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
+    return torch.cartesian_prod(*[torch.arange(2, device=device)] * 3)
+
+
+def _whole_cells(known: np.ndarray) -> np.ndarray:
+    """Cells whose eight corners are known, marked at the corner that scikit-image reads them by."""
+    whole = known.copy()
+    for axis in range(3):
+        shifted = np.zeros_like(whole)
+        inner = [slice(None)] * 3
+        inner[axis] = slice(1, None)
+        before = [slice(None)] * 3
+        before[axis] = slice(None, -1)
+        shifted[tuple(inner)] = whole[tuple(inner)] & whole[tuple(before)]
+        whole = shifted
+    return whole

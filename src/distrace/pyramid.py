@@ -1,0 +1,38 @@
+"""Coarse-to-fine starts: one coarse ray marches for the pixels around it (Liu et al., CVPR 2020, section 3.1)."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.field import SDF
+from distrace.rays import meet_sphere
+from distrace.trace import Outcome, TraceConfig, sphere_trace
+
+
+@torch.no_grad()
+def starts(sdf: SDF, camera: Camera, radius: float, config: TraceConfig) -> tuple[Float[Tensor, "*batch height width"], int]:
+    """Distances at which the rays of an image may start, and the evaluations that this took.
+
+    Each level marches `coarse_steps` and hands its distances to four rays each. A ray whose coarse one missed or left the
+    bounds starts afresh; depth is never taken from a coarse ray.
+    """
+    distance, evaluations = None, 0
+    for level in range(config.coarse_levels, 0, -1):
+        coarse = camera.resized(0.5**level)
+        rays = coarse.rays()
+        begin = None if distance is None else _split(distance, coarse)
+        few = replace(config, steps=config.coarse_steps, tolerance=float(torch.as_tensor(config.tolerance).min()))
+        trace = sphere_trace(sdf, rays, meet_sphere(rays, radius), few, begin)
+        lost = (trace.outcome == Outcome.ESCAPED) | (trace.outcome == Outcome.INSIDE)
+        distance = torch.where(lost, -torch.inf, trace.stopped)
+        evaluations += trace.total_evaluations
+    assert distance is not None
+    return _split(distance, camera), evaluations
+
+
+def _split(distance: Float[Tensor, "*batch h w"], camera: Camera) -> Float[Tensor, "*batch height width"]:
+    fine = distance.repeat_interleave(2, dim=-1).repeat_interleave(2, dim=-2)
+    return fine[..., : camera.height, : camera.width]

@@ -1,0 +1,53 @@
+"""Rays, and where they meet the bounds of a field."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Half lines origin + t · direction; directions have unit length, so t is a distance."""
+
+    origins: Float[Tensor, "*batch 3"]
+    directions: Float[Tensor, "*batch 3"]
+
+    @property
+    def shape(self) -> torch.Size:
+        return self.directions.shape[:-1]
+
+    def at(self, distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+        return self.origins + distance[..., None] * self.directions
+
+    def __getitem__(self, index: Tensor | tuple | int) -> "Rays":
+        return Rays(self.origins[index], self.directions[index])
+
+    def flat(self) -> "Rays":
+        return Rays(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))
+
+    def detach(self) -> "Rays":
+        return Rays(self.origins.detach(), self.directions.detach())
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The stretch of each ray that is looked at; empty (near > far) where the ray misses what bounds the field."""
+
+    near: Float[Tensor, "*batch"]
+    far: Float[Tensor, "*batch"]
+
+    @property
+    def meets(self) -> Tensor:
+        return self.near < self.far
+
+
+def meet_sphere(rays: Rays, radius: float = 1.0) -> Bounds:
+    """Where rays are within a sphere around the origin: |o + t v| ≤ radius, t ≥ 0."""
+    towards = -(rays.origins * rays.directions).sum(-1)
+    nearest = (rays.origins + towards[..., None] * rays.directions).square().sum(-1)  # no cancellation from far away
+    half = (radius**2 - nearest).clamp_min(0).sqrt()
+    near, far = (towards - half).clamp_min(0), towards + half
+    misses = (nearest >= radius**2) | (far <= 0)
+    return Bounds(near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf))

@@ -1,0 +1,97 @@
+"""The whole way from a field and a camera to images, on one page."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from distrace import pyramid, surface
+from distrace.camera import Camera
+from distrace.field import SDF
+from distrace.rays import Rays, meet_sphere
+from distrace.trace import Trace, TraceConfig, sphere_trace
+
+
+@dataclass(frozen=True)
+class Buffers:
+    """What a camera sees of a field. Each image is made when first asked for, and differentiable in all that went in."""
+
+    sdf: SDF
+    rays: Rays
+    cosines: Float[Tensor, "*batch"]  # depth over distance
+    trace: Trace
+    radius: float
+
+    @property
+    def mask(self) -> Bool[Tensor, "*batch"]:
+        return self.trace.hit
+
+    @cached_property
+    def distance(self) -> Float[Tensor, "*batch"]:
+        """Along the ray; `inf` where nothing was hit."""
+        hit = self.trace.hit
+        if not torch.is_grad_enabled() or not hit.any():
+            return self.trace.distance
+        attached = surface.attach(self.sdf, self.rays[hit], self.trace.distance[hit])
+        return self.trace.distance.masked_scatter(hit, attached)
+
+    @cached_property
+    def depth(self) -> Float[Tensor, "*batch"]:
+        """Along the optical axis; `inf` where nothing was hit."""
+        missed = ~self.trace.hit
+        along = self.distance.masked_fill(missed, 0.0)  # inf times a zero gradient would be NaN
+        return (along * self.cosines).masked_fill(missed, torch.inf)
+
+    @cached_property
+    def points(self) -> Float[Tensor, "hits 3"]:
+        """Where the rays of the mask hit, in the world."""
+        hit = self.trace.hit
+        return self.rays[hit].at(self.distance[hit])
+
+    @cached_property
+    def normal(self) -> Float[Tensor, "*batch 3"]:
+        """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
+        hit = self.trace.hit[..., None].expand(*self.trace.hit.shape, 3)
+        empty = torch.zeros_like(self.rays.directions)
+        return empty.masked_scatter(hit, surface.normals(self.sdf, self.points)) if hit.any() else empty
+
+    @cached_property
+    def clearance(self) -> Float[Tensor, "*batch"]:
+        """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations of the field."""
+        met = torch.isfinite(self.trace.closest)
+        least = torch.full_like(self.trace.closest, torch.inf)
+        if not met.any():
+            return least
+        hit = self.trace.hit[met]
+        rays, closest = self.rays[met], self.trace.closest[met]
+        if (~hit).any():
+            lowest = surface.minimum(self.sdf, rays[~hit].detach(), closest[~hit])
+            closest = closest.masked_scatter(~hit, lowest)
+        return least.masked_scatter(met, self.sdf(rays.at(closest)))
+
+
+def render(sdf: SDF, camera: Camera, *, radius: float = 1.0, config: TraceConfig = TraceConfig()) -> Buffers:
+    """Renders a field inside a sphere of `radius` around the origin, as a camera sees it.
+
+    The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera.
+    Raises `ValueError` for a radius that is not positive.
+    """
+    if not radius > 0:
+        raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")
+    start, setup = pyramid.starts(sdf, camera, radius, config) if config.coarse_levels else (None, 0)
+    steps = max(config.steps - config.coarse_levels * config.coarse_steps, 1)
+    rays = camera.rays()
+    trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), replace(config, steps=steps), start)
+    trace = replace(trace, setup_evaluations=trace.setup_evaluations + setup)
+    return Buffers(sdf, rays, camera.cosines(), trace, radius)
+
+
+def render_rays(
+    sdf: SDF, camera: Camera, pixels: Float[Tensor, "n 2"], *, radius: float = 1.0, config: TraceConfig = TraceConfig()
+) -> Buffers:
+    """The same for some pixel positions (x, y) alone: what a loss on sparse observations needs. No coarse levels."""
+    rays = camera.rays(pixels)
+    trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), config)
+    return Buffers(sdf, rays, camera.cosines(pixels), trace, radius)

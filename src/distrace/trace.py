@@ -1,0 +1,165 @@
+"""Sphere tracing without gradients: one march, whose configurations are the strategies of DIST (Liu et al., CVPR 2020)."""
+
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from distrace.field import SDF
+from distrace.rays import Bounds, Rays
+
+
+class Outcome(IntEnum):
+    """What became of a ray."""
+
+    ESCAPED = 0  # left the bounds, or never met them
+    HIT = 1  # |sdf| fell below the tolerance
+    EXHAUSTED = 2  # neither, within the steps
+    INSIDE = 3  # starts in the solid
+
+
+@dataclass(frozen=True)
+class TraceConfig:
+    """How rays are marched: t ← t + step_scale · f, until |f| < tolerance."""
+
+    steps: int = 50
+    step_scale: float = 1.5  # above 1 is DIST's aggressive marching: the sign of f walks an overshoot back
+    step_limit: float = 0.1  # f is clamped to ± this: decoders are trained on clamped distances and know no larger one
+    tolerance: float | Float[Tensor, "*batch"] = 5e-5  # also per ray, as `Camera.tolerance` gives it
+    compaction: bool = True  # only rays still on their way are queried; without, every ray at every step
+    coarse_levels: int = 2  # the march starts at 1 / 2^levels of the resolution …
+    coarse_steps: int = 3  # … and splits each ray into four after so many steps
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.step_scale <= 0 or self.step_limit <= 0:
+            raise ValueError(f"{self} cannot march: steps, step_scale and step_limit must be positive")
+
+
+PARALLEL = TraceConfig(step_scale=1.0, compaction=False, coarse_levels=0)
+DYNAMIC = replace(PARALLEL, compaction=True)
+AGGRESSIVE = replace(DYNAMIC, step_scale=1.5)
+COARSE_TO_FINE = replace(AGGRESSIVE, coarse_levels=2)
+STRATEGIES = {"parallel": PARALLEL, "dynamic": DYNAMIC, "aggressive": AGGRESSIVE, "coarse_to_fine": COARSE_TO_FINE}
+
+
+@dataclass(frozen=True)
+class Trace:
+    """Where rays ended. Distances are along the unit ray; `inf` where a ray did not hit."""
+
+    distance: Float[Tensor, "*batch"]
+    outcome: Int[Tensor, "*batch"]
+    closest: Float[Tensor, "*batch"]  # the distance at which |sdf| was least
+    stopped: Float[Tensor, "*batch"]  # where the march stood when it ended, whatever the outcome
+    evaluations: Int[Tensor, "*batch"]  # of the field, for this ray
+    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels
+
+    @property
+    def hit(self) -> Bool[Tensor, "*batch"]:
+        return self.outcome == Outcome.HIT
+
+    @property
+    def total_evaluations(self) -> int:
+        return self.setup_evaluations + int(self.evaluations.sum())
+
+    def reshaped(self, shape: torch.Size) -> "Trace":
+        fields = (self.distance, self.outcome, self.closest, self.stopped, self.evaluations)
+        return Trace(*(values.reshape(shape) for values in fields), self.setup_evaluations)
+
+
+@torch.no_grad()
+def sphere_trace(
+    sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = TraceConfig(), start: Float[Tensor, "*batch"] | None = None
+) -> Trace:
+    """Marches every ray within its bounds, from `near` or from `start`.
+
+    A ray's result does not depend on the rays beside it. The last step of a ray is the secant through its last two
+    values, which costs no query. Coarse levels belong to images: see `pyramid.starts`.
+    """
+    march = _March.begin(rays.detach().flat(), bounds, config, start)
+    for _ in range(config.steps):
+        if not march.step(sdf, config):
+            break
+    return march.result().reshaped(rays.shape)
+
+
+@dataclass
+class _March:
+    """The state of all rays that meet the bounds, flat."""
+
+    rays: Rays
+    near: Tensor
+    far: Tensor
+    tolerance: Tensor
+    t: Tensor
+    last_t: Tensor  # the sample before, for the secant
+    last_value: Tensor
+    least: Tensor  # |sdf| at `closest`
+    closest: Tensor
+    outcome: Tensor  # -1: still on its way
+    evaluations: Tensor
+
+    @staticmethod
+    def begin(rays: Rays, bounds: Bounds, config: TraceConfig, start: Tensor | None) -> "_March":
+        near, far = bounds.near.reshape(-1), bounds.far.reshape(-1)
+        meets = near < far
+        t = near if start is None else start.reshape(-1).clamp(near, far)
+        nothing = torch.full_like(near, torch.nan)
+        tolerance = torch.as_tensor(config.tolerance, dtype=near.dtype, device=near.device)
+        return _March(
+            rays,
+            near,
+            far,
+            tolerance.expand(bounds.near.shape).reshape(-1),
+            torch.where(meets, t, torch.inf),
+            last_t=nothing,
+            last_value=nothing.clone(),
+            least=torch.full_like(near, torch.inf),
+            closest=torch.where(meets, t, torch.inf),
+            outcome=torch.where(meets, -1, int(Outcome.ESCAPED)),
+            evaluations=torch.zeros_like(near, dtype=torch.int64),
+        )
+
+    def step(self, sdf: SDF, config: TraceConfig) -> bool:
+        """One query of the rays on their way (or of all); False once there are none."""
+        under_way = (self.outcome == -1).nonzero()[:, 0]
+        if not len(under_way):
+            return False
+        queried = under_way if config.compaction else (self.near < self.far).nonzero()[:, 0]
+        self.evaluations[queried] += 1
+        value = sdf(self.rays[queried].at(self.t[queried]))
+        if not config.compaction:
+            value = value[self.outcome[queried] == -1]
+        self._record(under_way, value)
+        self._advance(under_way, value, config)
+        return True
+
+    def _record(self, at: Tensor, value: Tensor) -> None:
+        nearer = value.abs() < self.least[at]
+        self.least[at] = torch.where(nearer, value.abs(), self.least[at])
+        self.closest[at] = torch.where(nearer, self.t[at], self.closest[at])
+
+    def _advance(self, at: Tensor, value: Tensor, config: TraceConfig) -> None:
+        t, near, tolerance = self.t[at], self.near[at], self.tolerance[at]
+        converged = value.abs() < tolerance
+        inside = (t <= near) & (value < 0) & ~converged
+        following = (t + config.step_scale * value.clamp(-config.step_limit, config.step_limit)).maximum(near)
+        escaped = (following > self.far[at]) & ~converged
+        outcome = torch.full_like(self.outcome[at], -1)
+        for reached, name in ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT)):
+            outcome = outcome.masked_fill(reached, int(name))
+        self.outcome[at] = outcome
+        self.t[at] = torch.where(converged, t + self._secant(at, value), torch.where(outcome == -1, following, t))
+        self.last_t[at], self.last_value[at] = t, value
+
+    def _secant(self, at: Tensor, value: Tensor) -> Tensor:
+        """From a converged sample to the zero of the line through it and the one before, if that is close by."""
+        move = -value * (self.t[at] - self.last_t[at]) / (value - self.last_value[at])
+        return torch.where(move.abs() <= 20 * value.abs(), move, 0.0)  # NaN, on a first sample, compares false
+
+    def result(self) -> Trace:
+        outcome = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED))
+        hit = outcome == Outcome.HIT
+        closest = torch.where(hit, self.t, self.closest)
+        return Trace(self.t.masked_fill(~hit, torch.inf), outcome, closest, self.t, self.evaluations)

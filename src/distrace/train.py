@@ -1,0 +1,152 @@
+"""Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.errors import explained
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The schedule: a short warm-up, then a cosine down to zero at `steps`."""
+
+    steps: int = 36_000
+    samples_per_step: int = 2048  # half of them outside; small and many steps beat large and few, minute for minute
+    shapes_per_step: int = 64
+    learning_rate: float = 1e-3
+    code_learning_rate: float = 2e-3
+    warm_up: float = 0.02  # share of the steps
+    clamp: float = 0.1  # distances beyond are learnt as "far"
+    code_penalty: float = 1e-4
+    code_bound: float = 1.0
+    code_deviation: float = 0.05  # of a code's entries at the start
+    bfloat16: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Signed samples of the shapes to learn."""
+
+    names: list[str]
+    outside: list[Float[Tensor, "_ 4"]]
+    inside: list[Float[Tensor, "_ 4"]]
+
+    def to(self, device: torch.device) -> "Samples":
+        return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
+
+
+@dataclass
+class Training:
+    """What a run changes as it goes on, and what a checkpoint holds."""
+
+    decoder: Decoder
+    codes: nn.Parameter  # [shapes, length]
+    optimiser: torch.optim.Adam
+    step: int = 0
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step done: its loss, and how long it took."""
+
+    step: int
+    loss: float
+    seconds: float
+
+
+def load_samples(paths: list[Path]) -> Samples:
+    """Reads DeepSDF's `.npz` files. Raises `ValueError` for a file without `pos` and `neg` of shape [n, 4]."""
+    outside, inside = [], []
+    for path in paths:
+        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg"):
+            with np.load(path, allow_pickle=False) as archive:
+                pos, neg = archive["pos"], archive["neg"]
+        for name, part in (("pos", pos), ("neg", neg)):
+            if part.ndim != 2 or part.shape[1] != 4 or not len(part) or not np.isfinite(part).all():
+                raise ValueError(f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed")
+        outside.append(torch.from_numpy(pos).float())
+        inside.append(torch.from_numpy(neg).float())
+    return Samples([path.stem for path in paths], outside, inside)
+
+
+def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
+    """A fresh network and codes, from the configuration's seed."""
+    torch.manual_seed(config.seed)
+    decoder = Decoder(specs).to(device)
+    codes = nn.Parameter(config.code_deviation * torch.randn(shapes, specs.code_length).to(device))
+    groups = [
+        {"params": list(decoder.parameters()), "peak": config.learning_rate},
+        {"params": [codes], "peak": config.code_learning_rate},
+    ]
+    return Training(decoder, codes, torch.optim.Adam(groups, lr=0.0, fused=True))
+
+
+def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator[Step]:
+    """Trains in place and yields after every step, from wherever `training` is to the last one.
+
+    The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
+    """
+    device = training.codes.device
+    training.decoder.train()
+    while training.step < config.steps:
+        began = time.perf_counter()
+        for group in training.optimiser.param_groups:
+            group["lr"] = group["peak"] * _rate(training.step / config.steps, config.warm_up)
+        torch.manual_seed((config.seed << 32) + training.step)
+        shapes, batch = draw(samples, config)
+        codes = training.codes[shapes]
+        with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
+            values = training.decoder(batch[..., :3], codes[:, None])
+        loss = clamped_loss(values.float(), batch[..., 3], config.clamp)
+        training.optimiser.zero_grad()
+        (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
+        training.optimiser.step()
+        bound_codes(training.codes, config.code_bound)
+        training.step += 1
+        yield Step(training.step, loss.item(), time.perf_counter() - began)
+
+
+def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:
+    """A step's shapes, and as many samples inside as outside of each."""
+    count = min(config.shapes_per_step, len(samples.names))
+    shapes = torch.randperm(len(samples.names))[:count]
+    per_side = max(config.samples_per_step // count // 2, 1)
+    sides = [(samples.outside[shape], samples.inside[shape]) for shape in shapes]
+    batch = [torch.cat([side[torch.randint(len(side), (per_side,))] for side in pair]) for pair in sides]
+    return shapes, torch.stack(batch)
+
+
+def clamped_loss(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
+    """Mean |clamp(f) − clamp(d)| (Park et al. 2019, eq. 4)."""
+    return (values.clamp(-clamp, clamp) - distances.clamp(-clamp, clamp)).abs().mean()
+
+
+@torch.no_grad()
+def bound_codes(codes: Tensor, bound: float) -> None:
+    """Scales codes that are longer than the bound back to it."""
+    codes.mul_((bound / codes.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0))
+
+
+def _rate(progress: float, warm_up: float) -> float:
+    return min(1.0, progress / warm_up + 0.01) * (1 + math.cos(math.pi * progress)) / 2
+
+
+def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:
+    """Whether this machine trains faster with bfloat16 products: some processors emulate them."""
+    seconds = {}
+    for bfloat16 in (False, True, False, True):  # the second time of each counts
+        config = TrainConfig(steps=2, bfloat16=bfloat16)
+        random = [torch.rand(4096, 4) * 0.1]
+        run = train(Samples(["random"], random, random).to(device), start(1, specs, config, device), config)
+        seconds[bfloat16] = min(step.seconds for step in run)
+    return seconds[True] < seconds[False]
