@@ -22,11 +22,14 @@ class Camera:
     @staticmethod
     def from_matrices(intrinsics: Tensor, T_world_camera: Tensor, height: int, width: int) -> "Camera":
         """A camera from its two matrices; raises `ValueError` where they are not a camera's."""
-        if intrinsics.shape[-2:] != (3, 3) or T_world_camera.shape[-2:] != (4, 4):
+        batch = intrinsics.shape[:-2]
+        if intrinsics.shape != (*batch, 3, 3) or T_world_camera.shape != (*batch, 4, 4):
             given = f"{list(intrinsics.shape)} and {list(T_world_camera.shape)}"
-            raise ValueError(f"matrices of shapes {given} were given; intrinsics are [3, 3] and T_world_camera is [4, 4]")
-        if height < 1 or width < 1:
-            raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be at least 1")
+            raise ValueError(
+                f"matrices of shapes {given} were given; intrinsics are [3, 3] and T_world_camera is [4, 4], after the"
+                " same batch axes"
+            )
+        _check_size(height, width)
         _check_values(intrinsics, T_world_camera)
         return Camera(intrinsics, T_world_camera, height, width)
 
@@ -43,14 +46,14 @@ class Camera:
     ) -> "Camera":
         """A camera at `eye` that sees `target` in its middle and y pointing up.
 
-        The focal length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the eye
-        is at the target, or a length is not positive.
+        The focal length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the
+        eye is at the target, or a length is not positive.
         """
+        _check_size(height, width)
         focal = width * focal_mm / sensor_mm if focal_px is None and sensor_mm > 0 else (focal_px or 0.0)
         if not (focal > 0 and math.isfinite(focal)):
-            raise ValueError(
-                f"a focal length of {focal_px or focal_mm} on a sensor of {sensor_mm} was given; both must be positive"
-            )
+            given = focal_mm if focal_px is None else focal_px
+            raise ValueError(f"a focal length of {given} on a sensor of {sensor_mm} was given; both must be positive")
         forward = target - eye
         if not forward.norm() > 0:
             raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
@@ -147,16 +150,27 @@ class Camera:
         return (inverse @ homogeneous[..., None])[..., 0]
 
 
+def _check_size(height: int, width: int) -> None:
+    if height < 1 or width < 1:
+        raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be at least 1")
+
+
 def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:
     if not (intrinsics.isfinite().all() and T_world_camera.isfinite().all()):
         raise ValueError("the camera's matrices hold values that are not finite")
+    for name, matrix in (("intrinsics", intrinsics), ("T_world_camera", T_world_camera)):
+        last = matrix.detach()[..., -1, :]
+        if not torch.allclose(last, torch.eye(matrix.shape[-1], dtype=last.dtype, device=last.device)[-1]):
+            raise ValueError(f"the last row of {name} is {last.tolist()}, not 0 … 0 1; is the matrix transposed?")
     focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
     if not (focal > 0).all():
         raise ValueError(f"focal lengths of {focal.tolist()} pixels were given; they must be positive")
     rotation = T_world_camera.detach()[..., :3, :3].double()
-    error = (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+    error = (
+        (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+    )
     if error > 1e-3 or (torch.linalg.det(rotation) < 0).any():
         raise ValueError(
-            f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right, y down,"
-            " z forward) to the world, without scale or mirroring"
+            f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right,"
+            " y down, z forward) to the world, without scale or mirroring"
         )

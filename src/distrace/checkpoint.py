@@ -1,12 +1,14 @@
 """Models on disk: DeepSDF's experiment folders, in every dialect that writers of them have used, and the bundled ones.
 
-A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and `LatentCodes/NAME.pth`
-(DeepSDF's). Nothing in a file is ever run.
+A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and
+`LatentCodes/NAME.pth` (DeepSDF's). Nothing in a file is ever run.
 """
 
 import json
+import pickle
 import re
-from dataclasses import asdict, dataclass
+import warnings
+from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
@@ -20,12 +22,15 @@ from distrace.errors import explained
 from distrace.field import SDF
 from distrace.files import written
 
+BUNDLED = Path(str(files("distrace"))) / "models"
 LATEST = "latest.pth"
+BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
+SPLINES = "latent_fields_state_dict"
 
 
 @dataclass(frozen=True)
 class Model:
-    """A trained decoder and the codes of the shapes it was trained on. Its weights are frozen: `requires_grad_()` thaws."""
+    """A trained decoder and the codes of the shapes it was trained on. Weights are frozen: `requires_grad_()` thaws."""
 
     name: str
     decoder: Decoder
@@ -49,7 +54,7 @@ class Model:
 
 def bundled_models() -> list[str]:
     """The names that `load_model` knows without a folder."""
-    return sorted(folder.name for folder in (files("distrace") / "models").iterdir() if folder.is_dir())
+    return sorted(path.parent.name for path in BUNDLED.glob("*/specs.json"))
 
 
 def load_model(name: str | Path) -> Model:
@@ -57,20 +62,16 @@ def load_model(name: str | Path) -> Model:
 
     Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
     """
-    if str(name) in bundled_models():
-        folder = Path(str(files("distrace") / "models" / str(name)))
-    else:
-        folder = Path(name)
+    folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
     if not folder.is_dir():
         raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
     specs, shapes = _read_specs(folder)
     ours = folder / "model.safetensors"
     source, state, codes = _read_safetensors(ours) if ours.exists() else _read_deepsdf(folder)
-    decoder = _filled(Decoder(specs), state, source)
-    if codes.shape[1] != specs.code_length:
-        raise ValueError(f"{folder} has codes of {codes.shape[1]} numbers, but specs.json says {specs.code_length}")
-    if not codes.isfinite().all():
-        raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
+    with explained(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
+        decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
+    decoder = _filled(decoder, state, source)
+    _check_codes(codes, specs, folder)
     names = shapes if len(shapes) == len(codes) else tuple(str(number) for number in range(len(codes)))
     return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
 
@@ -78,11 +79,11 @@ def load_model(name: str | Path) -> Model:
 def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
     """Writes our own, smaller form: weight norm multiplied out, in half precision."""
     specs = model.decoder.specs
-    tensors = {"codes": model.codes.to(dtype).contiguous()}
+    plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
+    tensors = {key: value for key, value in model.decoder.state_dict().items() if "parametrizations" not in key}
+    tensors |= {"codes": model.codes}
     for layer in range(model.decoder.depth):
-        linear = getattr(model.decoder, f"lin{layer}")
-        tensors |= {f"lin{layer}.weight": linear.weight, f"lin{layer}.bias": linear.bias}
-    plain = NetworkSpecs(**{**asdict(specs), "norm_layers": (), "weight_norm": False})
+        tensors[f"lin{layer}.weight"] = getattr(model.decoder, f"lin{layer}").weight
     _write_specs(folder, plain, model.shapes)
     with written(folder / "model.safetensors") as file:
         file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
@@ -120,26 +121,37 @@ def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> 
 def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
     path = folder / "specs.json"
     if not path.is_file():
-        raise ValueError(f"{folder} has no specs.json, which names the network's layers; it is not a DeepSDF experiment")
+        raise ValueError(
+            f"{folder} is not a DeepSDF experiment: it has no specs.json, which names the network's layers"
+        )
     with explained(f"{path} is not a DeepSDF specification"):
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text(encoding="utf-8"))
+        _check_architecture(content)
         network = content["NetworkSpecs"]
         specs = NetworkSpecs(
             dims=tuple(int(width) for width in network["dims"]),
             code_length=int(content["CodeLength"]),
-            latent_in=tuple(network.get("latent_in") or ()),
-            norm_layers=tuple(network.get("norm_layers") or ()),
+            latent_in=_layers(network, "latent_in"),
+            norm_layers=_layers(network, "norm_layers"),
             weight_norm=bool(network.get("weight_norm", False)),
             xyz_in_all=bool(network.get("xyz_in_all", False)),
             use_tanh=bool(network.get("use_tanh", False)),
-            dropout=tuple(network.get("dropout") or ()),
+            dropout=_layers(network, "dropout"),
             dropout_prob=float(network.get("dropout_prob") or 0.0),
         )
-        shapes = tuple(str(shape) for shape in content.get("Shapes", ()))
-    architecture = content.get("NetworkArch", "deep_sdf_decoder")
-    if architecture != "deep_sdf_decoder" or network.get("geom_dimension", 3) != 3:
-        raise ValueError(f"{path} describes the network {architecture}; only deep_sdf_decoder of 3-D points can be read")
+        shapes = tuple(str(shape) for shape in content.get("Shapes") or ())
     return specs, shapes
+
+
+def _check_architecture(content: dict) -> None:
+    architecture = content.get("NetworkArch") or "deep_sdf_decoder"
+    dimension = content["NetworkSpecs"].get("geom_dimension") or 3
+    if architecture != "deep_sdf_decoder" or dimension != 3:
+        raise ValueError(f"{architecture} of {dimension}-D points; only deep_sdf_decoder of 3-D points can be read")
+
+
+def _layers(network: dict, key: str) -> tuple[int, ...]:
+    return tuple(int(layer) for layer in network.get(key) or ())
 
 
 def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
@@ -152,36 +164,58 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
 def _read_deepsdf(folder: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
     weights = _checkpoint(folder / "ModelParameters")
     with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict"):
-        content = torch.load(weights, map_location="cpu", weights_only=True)
-        state = {_modern(key): tensor.float() for key, tensor in content["model_state_dict"].items()}
+        stored = _unpickled(weights)["model_state_dict"]
+        state = {_modern(key): tensor.float() for key, tensor in stored.items() if BESIDE not in key}
     latent = folder / "LatentCodes" / weights.name
     if not latent.is_file():
         raise ValueError(f"{latent} is missing: the codes that belong to {weights.name} of ModelParameters")
     with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes"):
-        codes = _codes(torch.load(latent, map_location="cpu", weights_only=True)["latent_codes"])
+        codes = _codes(_unpickled(latent))
     return weights, state, codes
+
+
+def _unpickled(path: Path) -> dict:
+    """A file of tensors, and nothing that a pickle could run."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, KeyError):
+        raise ValueError("it holds something else than tensors; nothing in it was run") from None
 
 
 def _checkpoint(folder: Path) -> Path:
     """`latest.pth`, or else the one of the most epochs."""
-    found = sorted(folder.glob("*.pth"), key=lambda path: (path.stem.isdigit(), int(path.stem) if path.stem.isdigit() else 0))
+    found = sorted(folder.glob("*.pth"), key=lambda path: int(path.stem) if path.stem.isdecimal() else -1)
     if not found:
         raise ValueError(f"{folder} holds no checkpoint; {LATEST} or one named by its epoch (2000.pth) is looked for")
     return folder / LATEST if (folder / LATEST) in found else found[-1]
 
 
-def _codes(stored: Tensor | dict[str, Tensor] | list[Tensor]) -> Float[Tensor, "shapes length"]:
+def _codes(content: dict) -> Float[Tensor, "shapes length"]:
+    """A code per shape; or, where codes vary over space (DeepSDFStruct's latent fields), all their control points."""
+    if SPLINES in content:  # their `latent_codes` are zeros
+        return torch.cat([value.float() for key, value in content[SPLINES].items() if key.endswith("control_points")])
+    stored = content["latent_codes"]
     if isinstance(stored, dict):
-        stored = stored["weight"]
+        stored = stored["weight"] if "weight" in stored else list(stored.values())
     if isinstance(stored, list):
         stored = torch.stack([code.reshape(-1) for code in stored])
     return stored.detach().float().reshape(len(stored), -1)
 
 
+def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
+    if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
+        given, wanted = list(codes.shape), f"[n, {specs.code_length}]"
+        raise ValueError(f"{folder} has codes of shape {given}, but specs.json asks for {wanted}")
+    if not codes.isfinite().all():
+        raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
+
+
 def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
     """The decoder with the weights put in, after a look at each: their names, shapes and values."""
     expected = decoder.state_dict()
-    for key in expected.keys() | state.keys():
+    for key in sorted(expected.keys() | state.keys()):
         if key not in state:
             raise ValueError(f"{source} lacks {key}, which specs.json calls for")
         if key not in expected:
@@ -191,5 +225,5 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
             raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
         if not state[key].isfinite().all():
             raise ValueError(f"{source}: {key} has values that are not finite; the training that wrote it has diverged")
-    decoder.load_state_dict(state)
+    decoder.load_state_dict(state, assign=True)
     return decoder

@@ -30,17 +30,24 @@ class NetworkSpecs:
 
 
 class Decoder(nn.Module):
-    """f(point; code): ReLU layers `lin0 … linN`, the input fed again at the layers `latent_in`, tanh at the end."""
+    """f(point; code): ReLU layers `lin0 … linN`, the input fed again at the layers `latent_in`, tanh at the end.
+
+    Raises `ValueError` for layers without room for what is fed again.
+    """
 
     def __init__(self, specs: NetworkSpecs = NetworkSpecs()) -> None:
         super().__init__()
         self.specs = specs
         widths = [specs.code_length + 3, *specs.dims, 1]
+        outputs = [self._outputs(widths, layer) for layer in range(self.depth)]
+        if specs.code_length < 1 or min(outputs) < 1:
+            given = f"a code of {specs.code_length} and layers of {outputs} outputs"
+            raise ValueError(f"{given} were asked for, what is fed again set apart; each must be at least 1")
         for layer in range(self.depth):
-            linear = nn.Linear(widths[layer], self._outputs(widths, layer))
+            linear = nn.Linear(widths[layer], outputs[layer])
             normed = layer in specs.norm_layers
             setattr(self, f"lin{layer}", weight_norm(linear) if normed and specs.weight_norm else linear)
-            if normed and not specs.weight_norm and layer < self.depth - 1:
+            if normed and not specs.weight_norm:  # the last layer's is never used, but DeepSDF's files hold it
                 setattr(self, f"bn{layer}", nn.LayerNorm(linear.out_features))
 
     @property
@@ -53,8 +60,10 @@ class Decoder(nn.Module):
         joins_points = self.specs.xyz_in_all and layer < self.depth - 1
         return widths[layer + 1] - (3 if joins_points else 0)
 
-    def forward(self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]) -> Float[Tensor, "*batch"]:
-        """Values in (-1, 1). A code with batch axes of size 1 is multiplied into the first layer once, not per point."""
+    def forward(
+        self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]
+    ) -> Float[Tensor, "*batch"]:
+        """Values in (-1, 1). A code with batch axes of size 1 enters the first layer once, not per point."""
         return self._run(self._folded(code), points)
 
     def field(self, code: Float[Tensor, "length"]) -> SDF:
@@ -63,7 +72,8 @@ class Decoder(nn.Module):
         Raises `ValueError` for a code of another length.
         """
         if code.shape != (self.specs.code_length,):
-            raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes [{self.specs.code_length}]")
+            takes = [self.specs.code_length]
+            raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
         layers = self._folded(code)
         size = CPU_CHUNK if code.device.type == "cpu" else GPU_CHUNK
         return chunked(lambda points: self._run(layers, points), size)

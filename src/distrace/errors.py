@@ -1,5 +1,6 @@
 """Errors that end in one sentence, whatever a library raised underneath."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,5 +11,6 @@ def explained(sentence: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:
-        cause = str(error).strip().splitlines()
-        raise ValueError(f"{sentence} ({cause[0]})" if cause else sentence) from error
+        cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]  # of a library's explanation, the first sentence
+        cause = f"no key {cause}" if isinstance(error, KeyError) else cause
+        raise ValueError(f"{sentence} ({cause})" if cause else sentence) from error

@@ -50,3 +50,14 @@ def placed(sdf: SDF, T_world_object: Float[Tensor, "4 4"]) -> SDF:
         return scale * sdf((points - translation) @ torch.linalg.inv(linear).T)
 
     return field
+
+
+class Counted:
+    """The same field, counting the points that it was asked for."""
+
+    def __init__(self, sdf: SDF) -> None:
+        self.sdf, self.evaluations = sdf, 0
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        self.evaluations += points.numel() // 3
+        return self.sdf(points)

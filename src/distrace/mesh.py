@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -37,7 +37,7 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     width = 2 * config.radius / config.resolution
     corners = _corners(_cells_at_surface(sdf, config))
     values = sdf(corners.float() * width - config.radius).cpu().numpy()
-    if not (values.min() < 0 < values.max()):
+    if not ((values < 0).any() and (values > 0).any()):
         raise ValueError(f"the field has no zero within {config.radius} of the origin: there is no surface to extract")
     grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
     grid[tuple(corners.cpu().numpy().T)] = values

@@ -43,7 +43,9 @@ def surface_points(surface: trimesh.Trimesh | np.ndarray, seed: int) -> Float[np
         return np.asarray(trimesh.sample.sample_surface(surface, POINTS, seed=seed)[0])
     points = np.asarray(surface)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ValueError(f"points of shape {list(points.shape)} were given; chamfer takes meshes or clouds of shape [n, 3]")
+        raise ValueError(
+            f"points of shape {list(points.shape)} were given; chamfer takes meshes or clouds of shape [n, 3]"
+        )
     return points
 
 

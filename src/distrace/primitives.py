@@ -1,4 +1,4 @@
-"""Analytic fields: primitives as closures, and combinations of fields (after Quilez, *Distance functions*, 2008 – 2021).
+"""Analytic fields: primitives as closures, and combinations of fields (after Quilez, *Distance functions*).
 
 Parameters may be tensors that require grad. Sizes are in the units of the world.
 """
@@ -96,5 +96,6 @@ def rounded(field: SDF, radius: Number) -> SDF:
 
 
 def _length(vector: Tensor) -> Tensor:
-    """The norm, with gradient zero, not NaN, at zero."""
-    return vector.norm(dim=-1)
+    """The norm, with derivatives zero at zero, where torch's own second one is NaN: normals on faces of a box."""
+    zero = (vector == 0).all(dim=-1)
+    return vector.masked_fill(zero[..., None], 1.0).norm(dim=-1).masked_fill(zero, 0.0)

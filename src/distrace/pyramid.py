@@ -13,11 +13,13 @@ from distrace.trace import Outcome, TraceConfig, sphere_trace
 
 
 @torch.no_grad()
-def starts(sdf: SDF, camera: Camera, radius: float, config: TraceConfig) -> tuple[Float[Tensor, "*batch height width"], int]:
+def starts(
+    sdf: SDF, camera: Camera, radius: float, config: TraceConfig
+) -> tuple[Float[Tensor, "*batch height width"], int]:
     """Distances at which the rays of an image may start, and the evaluations that this took.
 
-    Each level marches `coarse_steps` and hands its distances to four rays each. A ray whose coarse one missed or left the
-    bounds starts afresh; depth is never taken from a coarse ray.
+    Each level marches `coarse_steps` and hands its distances to four rays each. A ray whose coarse one missed or
+    left the bounds starts afresh; depth is never taken from a coarse ray.
     """
     distance, evaluations = None, 0
     for level in range(config.coarse_levels, 0, -1):

@@ -16,7 +16,7 @@ from distrace.trace import Trace, TraceConfig, sphere_trace
 
 @dataclass(frozen=True)
 class Buffers:
-    """What a camera sees of a field. Each image is made when first asked for, and differentiable in all that went in."""
+    """What a camera sees of a field. Images are made when first asked for, and differentiable in all that went in."""
 
     sdf: SDF
     rays: Rays
@@ -32,7 +32,7 @@ class Buffers:
     def distance(self) -> Float[Tensor, "*batch"]:
         """Along the ray; `inf` where nothing was hit."""
         hit = self.trace.hit
-        if not torch.is_grad_enabled() or not hit.any():
+        if not torch.is_grad_enabled():
             return self.trace.distance
         attached = surface.attach(self.sdf, self.rays[hit], self.trace.distance[hit])
         return self.trace.distance.masked_scatter(hit, attached)
@@ -55,19 +55,18 @@ class Buffers:
         """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
         hit = self.trace.hit[..., None].expand(*self.trace.hit.shape, 3)
         empty = torch.zeros_like(self.rays.directions)
-        return empty.masked_scatter(hit, surface.normals(self.sdf, self.points)) if hit.any() else empty
+        return empty.masked_scatter(hit, surface.normals(self.sdf, self.points))
 
     @cached_property
     def clearance(self) -> Float[Tensor, "*batch"]:
-        """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations of the field."""
+        """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations."""
         met = torch.isfinite(self.trace.closest)
         least = torch.full_like(self.trace.closest, torch.inf)
-        if not met.any():
-            return least
         hit = self.trace.hit[met]
         rays, closest = self.rays[met], self.trace.closest[met]
         if (~hit).any():
-            lowest = surface.minimum(self.sdf, rays[~hit].detach(), closest[~hit])
+            missing = rays[~hit].detach()
+            lowest = surface.minimum(self.sdf, missing, closest[~hit], meet_sphere(missing, self.radius))
             closest = closest.masked_scatter(~hit, lowest)
         return least.masked_scatter(met, self.sdf(rays.at(closest)))
 

@@ -1,4 +1,4 @@
-"""Sphere tracing without gradients: one march, whose configurations are the strategies of DIST (Liu et al., CVPR 2020)."""
+"""Sphere tracing without gradients: one march, whose configurations are DIST's strategies (Liu et al., CVPR 2020)."""
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -16,7 +16,7 @@ class Outcome(IntEnum):
 
     ESCAPED = 0  # left the bounds, or never met them
     HIT = 1  # |sdf| fell below the tolerance
-    EXHAUSTED = 2  # neither, within the steps
+    EXHAUSTED = 2  # neither, within the steps; or the field gave NaN
     INSIDE = 3  # starts in the solid
 
 
@@ -33,8 +33,8 @@ class TraceConfig:
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.step_scale <= 0 or self.step_limit <= 0:
-            raise ValueError(f"{self} cannot march: steps, step_scale and step_limit must be positive")
+        if self.steps < 1 or self.step_scale <= 0 or self.step_limit <= 0 or self.coarse_levels < 0:
+            raise ValueError(f"{self} cannot march: steps, step_scale and step_limit must be positive, and levels ≥ 0")
 
 
 PARALLEL = TraceConfig(step_scale=1.0, compaction=False, coarse_levels=0)
@@ -70,12 +70,17 @@ class Trace:
 
 @torch.no_grad()
 def sphere_trace(
-    sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = TraceConfig(), start: Float[Tensor, "*batch"] | None = None
+    sdf: SDF,
+    rays: Rays,
+    bounds: Bounds,
+    config: TraceConfig = TraceConfig(),
+    start: Float[Tensor, "*batch"] | None = None,
 ) -> Trace:
     """Marches every ray within its bounds, from `near` or from `start`.
 
-    A ray's result does not depend on the rays beside it. The last step of a ray is the secant through its last two
-    values, which costs no query. Coarse levels belong to images: see `pyramid.starts`.
+    A ray's result does not depend on the rays beside it. The last step of a ray goes to the zero of the secant through
+    its last two values, which costs no query; a ray whose field gives NaN ends there, EXHAUSTED. Coarse levels belong
+    to images: see `pyramid.starts`.
     """
     march = _March.begin(rays.detach().flat(), bounds, config, start)
     for _ in range(config.steps):
@@ -147,16 +152,22 @@ class _March:
         following = (t + config.step_scale * value.clamp(-config.step_limit, config.step_limit)).maximum(near)
         escaped = (following > self.far[at]) & ~converged
         outcome = torch.full_like(self.outcome[at], -1)
-        for reached, name in ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT)):
+        ends = ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT))
+        for reached, name in (*ends, (value.isnan(), Outcome.EXHAUSTED)):
             outcome = outcome.masked_fill(reached, int(name))
         self.outcome[at] = outcome
-        self.t[at] = torch.where(converged, t + self._secant(at, value), torch.where(outcome == -1, following, t))
+        polished = (t + self._to_zero(at, value)).clamp(near, self.far[at])
+        self.t[at] = torch.where(converged, polished, torch.where(outcome == -1, following, t))
         self.last_t[at], self.last_value[at] = t, value
 
-    def _secant(self, at: Tensor, value: Tensor) -> Tensor:
-        """From a converged sample to the zero of the line through it and the one before, if that is close by."""
+    def _to_zero(self, at: Tensor, value: Tensor) -> Tensor:
+        """From a converged sample to the zero of the line through it and the one before; else by the value itself.
+
+        The latter on a first sample (where the secant is NaN, which compares false) and along the surface: a step by
+        the distance never leads too far.
+        """
         move = -value * (self.t[at] - self.last_t[at]) / (value - self.last_value[at])
-        return torch.where(move.abs() <= 20 * value.abs(), move, 0.0)  # NaN, on a first sample, compares false
+        return torch.where(move.abs() <= 20 * value.abs(), move, value)
 
     def result(self) -> Trace:
         outcome = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED))

@@ -73,7 +73,9 @@ def load_samples(paths: list[Path]) -> Samples:
                 pos, neg = archive["pos"], archive["neg"]
         for name, part in (("pos", pos), ("neg", neg)):
             if part.ndim != 2 or part.shape[1] != 4 or not len(part) or not np.isfinite(part).all():
-                raise ValueError(f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed")
+                raise ValueError(
+                    f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed"
+                )
         outside.append(torch.from_numpy(pos).float())
         inside.append(torch.from_numpy(neg).float())
     return Samples([path.stem for path in paths], outside, inside)

@@ -88,9 +88,7 @@ def fetch(folder: Path) -> Path:
 
 def _download(folder: Path) -> Path:
     command = ["apt-get", "download", PACKAGE]
-    done = subprocess.run(
-        command, check=False, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True
-    )
+    done = subprocess.run(command, check=False, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True)
     found = list(folder.glob(f"{PACKAGE}_*.deb"))
     if done.returncode or not found:
         raise ValueError(done.stderr.strip().rpartition("\n")[2])
@@ -105,9 +103,7 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
     shelves = _shelves(_unpacked(deb, folder))
     if not shelves:
         raise ValueError(f"{deb} holds no furniture catalogue (.sh3f); {_BY_HAND}")
-    return [
-        _mesh(shelf, model, folder) for shelf in shelves for model in shelf.models if _has_mesh(shelf, model)
-    ]
+    return [_mesh(shelf, model, folder) for shelf in shelves for model in shelf.models if _has_mesh(shelf, model)]
 
 
 def write_catalogue(meshes: list[Mesh], path: Path) -> None:

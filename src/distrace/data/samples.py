@@ -30,7 +30,7 @@ class Doubt:
 
 
 def sample(solid: Solid, count: int, seed: int) -> Float[np.ndarray, "count 4"]:
-    """Points and signed distances: most are surface points displaced by Gaussian noise, the rest fill the unit sphere."""
+    """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""
     random = np.random.default_rng(seed)
     near = int(NEAR * count) // 2
     surface, _ = trimesh.sample.sample_surface(solid.surface, near, seed=seed)

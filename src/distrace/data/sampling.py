@@ -35,9 +35,7 @@ class Job:
 def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, stretches: int) -> list[Job]:
     """The shapes to sample; only those to train on have variants."""
     variants = {"train": (mirror, stretches)}
-    return [
-        Job(shape, meshes / shape.path, out, count, *variants.get(shape.split, (False, 0))) for shape in shapes
-    ]
+    return [Job(shape, meshes / shape.path, out, count, *variants.get(shape.split, (False, 0))) for shape in shapes]
 
 
 def run(todo: list[Job], workers: int) -> Iterator[Doubt]:

@@ -61,14 +61,14 @@ def turned(solid: Solid, degrees: float) -> Solid:
 
 
 def stretched(solid: Solid, factors: Float[np.ndarray, "3"]) -> Solid:
-    """The solid scaled by a factor along each axis (negative: mirrored), centred and scaled into the unit sphere again."""
+    """The solid scaled along each axis (negative: mirrored), then centred and scaled into the unit sphere again."""
     shape = _mapped(solid, np.diag([*factors, 1.0]))
     middle, scale = _frame(shape.soup)
     return _mapped(shape, trimesh.transformations.scale_and_translate(scale, -middle * scale))
 
 
 def _mapped(solid: Solid, matrix: np.ndarray) -> Solid:
-    """An affine map keeps the winding numbers, so the surface is mapped, not sought again; trimesh turns mirrored faces."""
+    """The surface is mapped, not sought again: affine maps keep winding numbers. Trimesh turns mirrored faces."""
     return Solid(solid.soup.copy().apply_transform(matrix), solid.surface.copy().apply_transform(matrix))
 
 

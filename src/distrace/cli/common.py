@@ -1,0 +1,52 @@
+"""Pieces of several commands: opening a model, and the files that a rendering leaves."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+
+from distrace import shading
+from distrace.camera import Camera
+from distrace.checkpoint import Model, load_model
+from distrace.files import written
+from distrace.render import Buffers
+
+ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+def opened(name: str, device: torch.device) -> Model:
+    return load_model(name).to(device)
+
+
+def picture(buffers: Buffers) -> shading.Picture:
+    """The shaded view."""
+    return shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
+
+
+def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:
+    pictures = {
+        "depth": shading.depth_picture(buffers.depth),
+        "normal": shading.normal_picture(buffers.normal, buffers.mask, camera.T_world_camera),
+        "mask": shading.mask_picture(buffers.mask),
+        "shaded": picture(buffers),
+    }
+    for name, image in pictures.items():
+        shading.save_png(folder / f"{name}.png", image)
+
+
+def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
+    arrays = {name: getattr(buffers, name) for name in ("depth", "distance", "normal", "mask")}
+    arrays |= {"evaluations": buffers.trace.evaluations, "outcome": buffers.trace.outcome}
+    if clearance:
+        arrays["clearance"] = buffers.clearance
+    with written(path) as file:
+        np.savez_compressed(file, **{name: array.cpu().numpy() for name, array in arrays.items()})
+
+
+def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
+    with written(path) as file:
+        file.write(mesh.export(file_type="ply"))

@@ -1,0 +1,191 @@
+"""`complete` and `demo`: a whole shape from one depth view."""
+
+from dataclasses import dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+
+from distrace import report, shading
+from distrace.checkpoint import Model
+from distrace.cli.common import ModelName, opened, save_mesh
+from distrace.cli.console import Run, console, progress, start
+from distrace.data.view import View, load_view
+from distrace.errors import explained
+from distrace.files import written
+from distrace.fit import FitConfig, Step, fit_shape, prior_of
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import Chamfer, chamfer
+from distrace.render import render
+
+OBSERVATIONS = files("distrace") / "observations"
+DEMO_POINTS = 100
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A fit, and everything that it took."""
+
+    steps: list[Step]
+    evaluations: int
+    mesh: trimesh.Trimesh
+    chamfer: Chamfer | None
+
+
+@dataclass(frozen=True)
+class Complete:
+    """Complete a shape from one depth view: mesh, code, and a page that shows how."""
+
+    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
+    out: Path = Path("out/complete")
+    reference: Path | None = None  # the true surface, to measure against: a mesh or points (PLY)
+    points: int | None = None  # use only so many of the depths, drawn at random
+    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
+    iterations: int = FitConfig.iterations
+    starts: int = FitConfig.starts
+    seed: int = 0
+    resolution: int = 128  # of the mesh
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        full = load_view(self.observation)
+        truth = None if self.reference is None else _reference(self.reference)
+        config = FitConfig(iterations=self.iterations, starts=self.starts, seed=self.seed)
+        _complete(
+            run,
+            opened(self.model, run.device),
+            _known(full, self.points, self.ignore, self.seed),
+            full,
+            truth,
+            config,
+            self.resolution,
+        )
+
+
+@dataclass(frozen=True)
+class Demo:
+    """Complete the bundled sofa, which the bundled model never saw, from 100 depths and its silhouette."""
+
+    out: Path = Path("out/demo")
+    seed: int = 0
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        (name,) = (Path(item.name).stem for item in OBSERVATIONS.iterdir() if item.name.endswith(".npz"))
+        full = load_view(Path(str(OBSERVATIONS / f"{name}.npz")))
+        truth = _reference(Path(str(OBSERVATIONS / f"{name}.ply")))
+        console.print(f"completing [bold]{name}[/bold] from {DEMO_POINTS} depths and its silhouette")
+        known = _known(full, DEMO_POINTS, ("normal",), self.seed)
+        _complete(run, opened("sofas", run.device), known, full, truth, FitConfig(seed=self.seed), 128)
+
+
+def _known(full: View, points: int | None, ignore: tuple[str, ...], seed: int) -> View:
+    if points is not None and points < 1:
+        raise ValueError(f"--points {points} was given; at least one depth is needed")
+    known = full if points is None else full.sparse(points, seed)
+    return replace(known, **{name: None for name in ignore})
+
+
+def _reference(path: Path) -> trimesh.Trimesh | np.ndarray:
+    with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface"):
+        loaded = trimesh.load(path, process=False)
+        if isinstance(loaded, trimesh.Scene):
+            loaded = loaded.to_geometry()
+        return loaded if len(getattr(loaded, "faces", ())) else np.asarray(loaded.vertices, dtype=np.float64)
+
+
+def _complete(
+    run: Run,
+    model: Model,
+    known: View,
+    full: View,
+    truth: trimesh.Trimesh | np.ndarray | None,
+    config: FitConfig,
+    resolution: int,
+) -> None:
+    prior = prior_of(model.codes)
+    outcome = _fitted(run, model, known, truth, config, resolution)
+    code = outcome.steps[-1].code
+    save_mesh(run.out / "mesh.ply", outcome.mesh)
+    with written(run.out / "code.npy") as file:
+        np.save(file, code.cpu().numpy())
+    camera = full.camera.to(run.device)
+    with torch.no_grad():
+        before, after = (report.View.of(render(model.field(shape), camera)) for shape in (prior.mean, code))
+    shading.save_png(run.out / "shaded.png", after.shaded)
+    with written(run.out / "report.html") as file:
+        file.write(report.completion_page(_story(run, known, full, before, after, truth, outcome, config)).encode())
+    last = outcome.steps[-1]
+    facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
+    distances = outcome.chamfer
+    if distances:
+        console.print(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
+        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+    run.finish({**facts, "setup_evaluations": 0})
+
+
+def _fitted(
+    run: Run, model: Model, known: View, truth: trimesh.Trimesh | np.ndarray | None, config: FitConfig, resolution: int
+) -> Outcome:
+    trials = config.trial * (config.starts - 1) if config.starts > 1 else 0
+    steps: list[Step] = []
+    with progress("fitting", config.iterations + trials) as bar:
+        for step in fit_shape(model.decoder, [known], prior_of(model.codes), config):
+            steps.append(step)
+            bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+    mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution, device=run.device))
+    evaluations = sum(step.evaluations for step in steps)
+    return Outcome(steps, evaluations, mesh, None if truth is None else chamfer(mesh, truth))
+
+
+def _story(
+    run: Run,
+    known: View,
+    full: View,
+    before: report.View,
+    after: report.View,
+    truth: trimesh.Trimesh | np.ndarray | None,
+    outcome: Outcome,
+    config: FitConfig,
+) -> report.Completion:
+    losses: dict[str, list[float]] = {}
+    for step in outcome.steps:
+        losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
+    facts = {
+        "depths used": str(int(known.seen.sum())),
+        "silhouette": "none" if known.mask is None else "used",
+        "iterations": f"{config.iterations}, after {config.trial} of each of {config.starts} starts",
+        "evaluations of the network": f"{outcome.evaluations:,}",
+        "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {run.device}",
+        "seed": str(config.seed),
+    }
+    return report.Completion(
+        title="A shape completed from one depth view",
+        observed_depth=known.depth.numpy(),
+        observed_mask=None if known.mask is None else known.mask.numpy(),
+        points_world=known.points().numpy(),
+        before=before,
+        after=after,
+        truth=_truth_view(full) if full is not known else None,
+        losses=losses,
+        mesh=outcome.mesh,
+        truth_points=truth.vertices if isinstance(truth, trimesh.Trimesh) else truth,
+        chamfer=outcome.chamfer,
+        facts=facts,
+        chosen=f"start {outcome.steps[-1].start + 1}",
+    )
+
+
+def _truth_view(full: View) -> report.View | None:
+    """What the observation holds beyond what was used, where it holds all of it."""
+    if full.mask is None or full.normal is None:
+        return None
+    shaded = shading.shaded_picture(full.normal, full.mask, full.camera.rays().directions)
+    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), shaded)

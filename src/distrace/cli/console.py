@@ -1,0 +1,105 @@
+"""What all commands share: progress, devices, and the result that each leaves behind."""
+
+import json
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+from distrace.files import written
+
+console = Console()
+errors = Console(stderr=True, soft_wrap=True)
+
+
+@dataclass
+class Run:
+    """One command at work: where it writes, since when, on what."""
+
+    out: Path
+    device: torch.device
+    began: float = field(default_factory=time.perf_counter)
+
+    def finish(self, facts: dict[str, Any]) -> None:
+        """Writes `result.json` and says where everything is."""
+        common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
+        save_json(self.out / "result.json", {**common, "version": version("distrace"), **facts})
+        console.print(f"wrote [bold]{self.out}[/bold] in {common['seconds']:.1f} s")
+
+
+def start(out: Path, device: str = "cpu") -> Run:
+    """Makes the folder. Raises `ValueError` for an `--out` that is a file, or a device that is not there."""
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"--out {out} is a file; give a folder to write to")
+    out.mkdir(parents=True, exist_ok=True)
+    return Run(out, chosen_device(device))
+
+
+def chosen_device(name: str) -> torch.device:
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    if name.startswith("cuda") and not torch.cuda.is_available():
+        raise ValueError(
+            f"--device {name} was asked for, but this machine or this build of PyTorch has no CUDA; use cpu"
+        )
+    try:
+        return torch.device(name)
+    except RuntimeError:
+        raise ValueError(f"--device {name} is no device; use auto, cpu or cuda") from None
+
+
+def device_name(device: torch.device) -> str:
+    return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({torch.get_num_threads()} threads)"
+
+
+def save_json(path: Path, content: Any) -> None:
+    with written(path) as file:
+        file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
+
+
+@contextmanager
+def progress(description: str, total: int) -> Iterator["Bar"]:
+    """A bar with the time left, and a few words that change as it goes on."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[words]}"),
+    )
+    with Progress(*columns, console=console) as bars:
+        yield Bar(bars, bars.add_task(description, total=total, words=""))
+
+
+@dataclass
+class Bar:
+    bars: Progress
+    task: Any
+
+    def advance(self, words: str = "", to: int | None = None) -> None:
+        if to is None:
+            self.bars.update(self.task, advance=1, words=words)
+        else:
+            self.bars.update(self.task, completed=to, words=words)
+
+
+def machine() -> str:
+    """Processor and library versions, for recorded tables."""
+    cpu = Path("/proc/cpuinfo")
+    names = (
+        [line.split(":", 1)[1].strip() for line in cpu.read_text().splitlines() if line.startswith("model name")]
+        if cpu.exists()
+        else []
+    )
+    return (
+        f"{names[0] if names else 'unknown processor'}, {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
+    )

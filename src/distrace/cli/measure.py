@@ -1,0 +1,123 @@
+"""`bench` and `evaluate`: tables of results, as JSON, as pictures and in the terminal."""
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.table import Table
+
+from distrace import shading
+from distrace.bench import Row, ablation, poster_view
+from distrace.cli.common import ModelName, opened
+from distrace.cli.console import Run, console, machine, progress, start
+from distrace.data.split import read_split
+from distrace.evaluate import (
+    METHODS,
+    Result,
+    completion_results,
+    picture_of,
+    summary,
+    training_results,
+)
+from distrace.fit import FitConfig
+from distrace.page import figure, page, section, table
+from distrace.trace import STRATEGIES
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure what each strategy costs and how far it is off, against a reference that takes no chances."""
+
+    what: tyro.conf.Positional[Literal["trace"]]  # trace: the strategies of tracing on the poster's view
+    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    out: Path = Path("out/bench")
+    code: int = 0  # which training shape
+    size: int = 512
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        field = opened(self.model, run.device).field(self.code)
+        rows: list[Row] = []
+        images = []
+        with progress(self.what, len(STRATEGIES)) as bar:
+            for row, buffers in ablation(field, poster_view(self.size).to(run.device), STRATEGIES):
+                rows.append(row)
+                images.append(shading.error_picture(buffers.trace.evaluations.float(), 50.0))
+                bar.advance(f"{row.strategy}: {row.queries} queries")
+        shading.save_png(run.out / "evaluations.png", shading.side_by_side(images))
+        recorded = [{"model": self.model, **row.asdict()} for row in rows]
+        _show(recorded)
+        run.finish({"rows": recorded, **_origin(), "evaluations": sum(row.queries for row in rows)})
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Make a table of results: how well a model knows its training shapes, or completes the held-out ones."""
+
+    name: tyro.conf.Positional[Literal["training", "completion"]]
+    model: ModelName = "sofas"
+    split: str = "sofas"
+    meshes: Path = Path("out/furniture")  # as `distrace data furniture` makes it
+    out: Path = Path("out/evaluate")
+    points: int = 100  # observed depths, for completion
+    seed: int = 0
+    resolution: int = 256  # of the meshes that are compared
+
+    def run(self) -> None:
+        run = start(self.out)
+        opened_model, shapes = opened(self.model, run.device), read_split(self.split)
+        if self.name == "training":
+            count = sum(shape.split == "train" for shape in shapes)
+            results = training_results(opened_model, shapes, self.meshes, self.resolution)
+        else:
+            count = sum(shape.split == "test" for shape in shapes) * len(METHODS)
+            results = completion_results(
+                opened_model, shapes, self.meshes, self.points, FitConfig(seed=self.seed), self.resolution
+            )
+        kept: list[Result] = []
+        with progress(self.name, count) as bar:
+            for result in results:
+                kept.append(result)
+                bar.advance(f"{result.shape}, {result.method}: {result.chamfer:.3f}")
+        _record(run, self.name, self.model, kept)
+
+
+def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
+    rows = [result.row(model) for result in results]
+    totals = summary(results)
+    _show(rows)
+    for method, values in totals.items():
+        console.print(f"{method}: " + ", ".join(f"{word} {value:.3f}" for word, value in values.items()))
+    sheet = picture_of(results)
+    shading.save_png(run.out / "shapes.png", sheet)
+    lead = "Chamfer distance × 1000: mean squared distances, 30,000 points a side, in the frame of the unit sphere."
+    cells = [[str(value) for value in row.values()] for row in rows]
+    parts = [
+        section("Table", table(list(rows[0]), cells)),
+        section("Shapes", figure(sheet, "true surface, then each method")),
+    ]
+    (run.out / "index.html").write_text(page(f"{name}: {model}", lead, parts))
+    run.finish({"rows": rows, "summary": totals, **_origin()})
+
+
+def _origin() -> dict[str, str]:
+    return {"command": " ".join(["distrace", *sys.argv[1:]]), "machine": machine()}
+
+
+def _show(rows: list[dict]) -> None:
+    shown = Table(*rows[0])
+    for row in rows:
+        shown.add_row(
+            *(
+                f"{value:.2e}"
+                if isinstance(value, float) and 0 < value < 0.01
+                else f"{value:g}"
+                if isinstance(value, float)
+                else str(value)
+                for value in row.values()
+            )
+        )
+    console.print(shown)

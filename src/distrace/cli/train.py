@@ -1,0 +1,106 @@
+"""`train`: from samples to a model, going on where it was stopped."""
+
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import tyro
+
+from distrace.bench import poster_view
+from distrace.checkpoint import Model, save_experiment
+from distrace.cli.common import picture
+from distrace.cli.console import Run, console, progress, start
+from distrace.data.split import read_split
+from distrace.decoder import NetworkSpecs
+from distrace.render import render
+from distrace.resume import load_training, save_training
+from distrace.shading import save_png, side_by_side
+from distrace.train import Samples, TrainConfig, Training, faster_in_bfloat16, load_samples
+from distrace.train import start as start_training
+from distrace.train import train as run_training
+
+TRIED = 20  # steps that tell how many fit into --minutes
+PREVIEWED = 5
+
+
+@dataclass(frozen=True)
+class Train:
+    """Train a DeepSDF decoder and the codes of its shapes. Run it again to go on after a stop."""
+
+    samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it
+    out: Path = Path("out/model")
+    split: str | None = None  # learn only the training shapes of this split, and their variants
+    minutes: float | None = None  # as many steps as fit, at the speed of the first ones
+    steps: int = TrainConfig.steps
+    samples_per_step: int = TrainConfig.samples_per_step
+    layers: int = 8
+    width: int = 512
+    code_length: int = 256
+    seed: int = 0
+    save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        loaded = load_samples(_sample_files(self.samples, self.split)).to(run.device)
+        resumed = load_training(self.out, loaded.names, run.device)
+        if resumed:
+            training, config = resumed
+            console.print(f"going on from step {training.step} of {config.steps}")
+        else:
+            specs = NetworkSpecs(
+                (self.width,) * self.layers, self.code_length, (self.layers // 2,), tuple(range(self.layers))
+            )
+            config = TrainConfig(steps=self.steps, samples_per_step=self.samples_per_step, seed=self.seed)
+            config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
+            training = start_training(len(loaded.names), specs, config, run.device)
+            config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
+        loss = _run(run, loaded, training, config, self.save_every)
+        run.finish({"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16})
+
+
+def _sample_files(folder: Path, split: str | None) -> list[Path]:
+    paths = sorted(folder.glob("*.npz"))
+    if split:
+        wanted = {shape.name for shape in read_split(split) if shape.split == "train"}
+        paths = [path for path in paths if path.stem.split("~")[0] in wanted]
+    if not paths:
+        raise ValueError(f"{folder} holds no samples (.npz) to learn; `distrace sample` makes them")
+    return paths
+
+
+def _as_long_as(
+    minutes: float, samples: Samples, specs: NetworkSpecs, config: TrainConfig, device: torch.device
+) -> TrainConfig:
+    """The configuration with as many steps as fit into the time, by the median of a few on a training of their own."""
+    trial = start_training(len(samples.names), specs, config, device)
+    seconds = sorted(step.seconds for step in run_training(samples, trial, replace(config, steps=TRIED)))
+    return replace(config, steps=max(int(minutes * 60 / seconds[TRIED // 2]), TRIED))
+
+
+def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, save_every: float) -> float:
+    """Trains to the end, saving now and then; the mean loss of the last steps."""
+    saved, loss = time.perf_counter(), 0.0
+    with progress("training", config.steps) as bar:
+        for step in run_training(samples, training, config):
+            loss = step.loss if not loss else 0.98 * loss + 0.02 * step.loss
+            bar.advance(f"loss {loss:.5f}", to=step.step)
+            if time.perf_counter() - saved > save_every:
+                _save(run, samples, training, config)
+                saved = time.perf_counter()
+    _save(run, samples, training, config)
+    return loss
+
+
+def _save(run: Run, samples: Samples, training: Training, config: TrainConfig) -> None:
+    """The checkpoint to go on from, the model in DeepSDF's layout, and a look at a few shapes."""
+    save_training(run.out, training, config, samples.names)
+    save_experiment(run.out, training.decoder, training.codes, tuple(samples.names))
+    training.decoder.eval()
+    codes = training.codes.detach()
+    model = Model(run.out.name, training.decoder, codes, tuple(samples.names))
+    camera = poster_view(128).to(run.device)
+    shown = range(0, len(codes), max(len(codes) // PREVIEWED, 1))
+    with torch.no_grad():
+        save_png(run.out / "preview.png", side_by_side([picture(render(model.field(n), camera)) for n in shown]))

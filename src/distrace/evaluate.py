@@ -1,0 +1,137 @@
+"""Results tables: how well a model knows its shapes, and how well shapes are completed from one sparse view."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from distrace.bench import poster_view
+from distrace.checkpoint import Model
+from distrace.data.solid import Solid, load_solid, turned
+from distrace.data.split import Shape
+from distrace.data.view import View, observe
+from distrace.fit import FitConfig, Step, fit_shape, prior_of
+from distrace.fit_samples import around_points, fit_samples
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.shading import Picture, grid, shaded_picture
+
+METHODS = ("deepsdf", "ours", "ours+mask")
+OBSERVATION_SIZE = 256
+
+
+@dataclass(frozen=True)
+class Result:
+    """A predicted surface beside the true one."""
+
+    shape: str
+    method: str
+    points: int  # observed; 0 for a training code
+    chamfer_to: float
+    chamfer_from: float
+    chamfer: float
+    seconds: float
+    mesh: trimesh.Trimesh
+    truth: trimesh.Trimesh
+
+    def row(self, model: str) -> dict[str, str | int | float]:
+        return {
+            "model": model,
+            "shape": self.shape,
+            "points": self.points,
+            "method": self.method,
+            "chamfer_to": round(self.chamfer_to, 4),
+            "chamfer_from": round(self.chamfer_from, 4),
+            "chamfer": round(self.chamfer, 4),
+            "seconds": round(self.seconds, 1),
+        }
+
+
+def solid_of(shape: Shape, meshes: Path) -> Solid:
+    """A shape of a split as it was learnt. Raises `ValueError` where its mesh is missing."""
+    path = meshes / shape.path
+    if not path.is_file():
+        raise ValueError(f"{path} is missing; `distrace data furniture --out {meshes}` fetches it")
+    return turned(load_solid(path), shape.turn)
+
+
+def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
+    """Each training shape as its code gives it, against the outer surface of its mesh."""
+    for shape in shapes:
+        if shape.split == "train" and shape.name in model.shapes:
+            truth = solid_of(shape, meshes).surface
+            code = model.codes[model.shapes.index(shape.name)]
+            yield compared(shape.name, "training code", 0, model, code, truth, 0.0, resolution)
+
+
+def completion_results(
+    model: Model, shapes: list[Shape], meshes: Path, points: int, config: FitConfig, resolution: int
+) -> Iterator[Result]:
+    """Each held-out shape completed from `points` depths of one view, by each method."""
+    for shape in shapes:
+        if shape.split == "test":
+            solid = solid_of(shape, meshes)
+            view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
+            for method in METHODS:
+                step, seconds = completed(model, view, method, config)
+                yield compared(shape.name, method, points, model, step.code, solid.surface, seconds, resolution)
+
+
+def completed(model: Model, view: View, method: str, config: FitConfig) -> tuple[Step, float]:
+    """The last step of a method's fit, and how long all of it took."""
+    if method == "deepsdf":
+        assert view.normal is not None, "DeepSDF is given the true normals"
+        steps = list(fit_samples(model.decoder, around_points(view.points(), view.normal[view.seen])))
+    else:
+        known = replace(view, normal=None, mask=view.mask if method == "ours+mask" else None)
+        steps = list(fit_shape(model.decoder, [known], prior_of(model.codes), config))
+    return steps[-1], sum(step.seconds for step in steps)
+
+
+def compared(
+    shape: str,
+    method: str,
+    points: int,
+    model: Model,
+    code: torch.Tensor,
+    truth: trimesh.Trimesh,
+    seconds: float,
+    resolution: int,
+) -> Result:
+    mesh = extract_mesh(model.field(code), MeshConfig(resolution))
+    distance = chamfer(mesh, truth)
+    return Result(shape, method, points, distance.to, distance.from_, distance.sum, seconds, mesh, truth)
+
+
+def summary(results: list[Result]) -> dict[str, dict[str, float]]:
+    """Mean, median and worst Chamfer of each method."""
+    values = {
+        method: np.array([result.chamfer for result in results if result.method == method])
+        for method in dict.fromkeys(result.method for result in results)
+    }
+    return {
+        method: {"mean": float(chamfers.mean()), "median": float(np.median(chamfers)), "worst": float(chamfers.max())}
+        for method, chamfers in values.items()
+    }
+
+
+def picture_of(results: list[Result]) -> Picture:
+    """Each shape as a row: the true surface, then what each method made of it."""
+    rows = []
+    for _, group in groupby(results, key=lambda result: result.shape):
+        of_shape = list(group)
+        rows.append([drawn(mesh) for mesh in (of_shape[0].truth, *(result.mesh for result in of_shape))])
+    return grid(rows)
+
+
+def drawn(mesh: trimesh.Trimesh) -> Picture:
+    """A mesh as the poster's camera sees it."""
+    camera = poster_view(OBSERVATION_SIZE)
+    view = observe(Solid(mesh, mesh), camera)
+    assert view.normal is not None
+    assert view.mask is not None
+    return shaded_picture(view.normal, view.mask, camera.rays().directions)

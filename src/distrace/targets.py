@@ -1,0 +1,62 @@
+"""Which rays of an observed view a loss looks at, and what it expects there."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from distrace.camera import Camera
+from distrace.data.view import View
+from distrace.rays import meet_sphere
+
+OUTLINE = 9  # pixels across the band in which half of the silhouette's rays are drawn
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Rays of one camera: a depth (`inf` if unknown), whether the object is there, and a normal (zero if unknown)."""
+
+    camera: Camera
+    pixels: Float[Tensor, "n 2"]
+    depth: Float[Tensor, "n"]
+    is_object: Bool[Tensor, "n"]
+    normal: Float[Tensor, "n 3"] | None
+
+
+@dataclass(frozen=True)
+class Pool:
+    """The pixels of a view that targets are drawn from, as flat indices."""
+
+    view: View
+    with_depth: Tensor
+    outline: Tensor
+    anywhere: Tensor  # whose rays meet the unit sphere
+
+    @staticmethod
+    def of(view: View) -> "Pool":
+        nothing = torch.empty(0, dtype=torch.int64)
+        with_depth = view.seen.reshape(-1).nonzero()[:, 0]
+        if view.mask is None:
+            return Pool(view, with_depth, nothing, nothing)
+        inner = view.mask[None].float()
+        band = max_pool2d(inner, OUTLINE, 1, OUTLINE // 2) != -max_pool2d(-inner, OUTLINE, 1, OUTLINE // 2)
+        meets = meet_sphere(view.camera.rays()).meets
+        outline, anywhere = ((region & meets).reshape(-1).nonzero()[:, 0] for region in (band[0], meets))
+        return Pool(view, with_depth, outline, anywhere)
+
+    def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator) -> Targets:
+        """At most so many rays with a depth, and as many of the silhouette: half along its outline, half anywhere."""
+        sets = ((self.with_depth, depth_rays), (self.outline, mask_rays // 2), (self.anywhere, mask_rays // 2))
+        chosen = torch.cat([_draw(indices, count, random) for indices, count in sets])
+        view = self.view
+        seen = view.seen.reshape(-1)[chosen]
+        is_object = seen if view.mask is None else seen | view.mask.reshape(-1)[chosen]
+        normal = None if view.normal is None else view.normal.reshape(-1, 3)[chosen]
+        pixels = view.camera.pixels().reshape(-1, 2)[chosen]
+        return Targets(view.camera, pixels, view.depth.reshape(-1)[chosen], is_object, normal)
+
+
+def _draw(indices: Tensor, count: int, random: torch.Generator) -> Tensor:
+    return indices[torch.randperm(len(indices), generator=random)[:count]]

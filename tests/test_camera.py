@@ -1,0 +1,195 @@
+"""The conventions of the camera: where it stands, where it looks, what a pixel sees."""
+
+import math
+
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from distrace.camera import Camera
+from distrace.rays import meet_sphere
+
+f64 = torch.float64
+orbits = st.builds(
+    Camera.orbit,
+    azimuth=st.floats(-360, 360),
+    elevation=st.floats(-90, 90),
+    distance=st.floats(0.5, 10),
+    height=st.integers(1, 9),
+    width=st.integers(1, 9),
+    focal_mm=st.floats(20, 100),
+    dtype=st.just(f64),
+)
+
+
+def poster(size: int = 512, dtype: torch.dtype = f64) -> Camera:
+    return Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=size, width=size, dtype=dtype)
+
+
+@given(azimuth=st.floats(-360, 360), elevation=st.floats(-90, 90), distance=st.floats(0.1, 10))
+def test_an_orbit_stands_where_the_contract_says_and_looks_at_the_origin(
+    azimuth: float, elevation: float, distance: float
+) -> None:
+    camera = Camera.orbit(azimuth, elevation, distance, dtype=f64)
+    az, el = math.radians(azimuth), math.radians(elevation)
+    eye = distance * torch.tensor([math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)], dtype=f64)
+    torch.testing.assert_close(camera.T_world_camera[:3, 3], eye)
+    forward = camera.rays(torch.tensor([[256.0, 256.0]], dtype=f64)).directions[0]
+    torch.testing.assert_close(forward, -eye / distance)
+    rotation = camera.T_world_camera[:3, :3]
+    torch.testing.assert_close(rotation @ rotation.T, torch.eye(3, dtype=f64))
+    assert torch.linalg.det(rotation) > 0
+
+
+@given(orbits)
+def test_the_origin_is_seen_in_the_middle_at_the_eyes_distance(camera: Camera) -> None:
+    pixel, depth = camera.project(torch.zeros(3, dtype=f64))
+    torch.testing.assert_close(pixel, torch.tensor([camera.width / 2, camera.height / 2], dtype=f64))
+    torch.testing.assert_close(depth, camera.T_world_camera[:3, 3].norm())
+
+
+def test_y_is_up_in_the_image_and_x_is_to_the_right_as_seen_from_z() -> None:
+    camera = Camera.orbit(0, 0, 4, height=100, width=100, dtype=f64)
+    (x, y), _ = camera.project(torch.tensor([0, 0.5, 0], dtype=f64))
+    assert x == pytest.approx(50)
+    assert y < 50
+    (x, y), _ = camera.project(torch.tensor([0.5, 0, 0], dtype=f64))
+    assert x > 50
+    assert y == pytest.approx(50)
+
+
+@pytest.mark.parametrize("elevation", [90, -90, 89.9999])
+def test_a_camera_may_look_straight_down_or_up(elevation: float) -> None:
+    camera = Camera.orbit(10, elevation, 3, height=3, width=3)
+    assert camera.rays().directions.isfinite().all()
+    torch.testing.assert_close(camera.rays().directions[1, 1], -camera.T_world_camera[:3, 3] / 3)
+
+
+def test_pixel_centres_are_at_a_half_and_images_are_rows_of_columns() -> None:
+    camera = Camera.orbit(0, 0, 4, height=3, width=5)
+    assert camera.pixels().shape == (3, 5, 2)
+    assert camera.pixels()[0, 0].tolist() == [0.5, 0.5]
+    assert camera.pixels()[1, 4].tolist() == [4.5, 1.5]
+    assert camera.rays().shape == (3, 5)
+
+
+@given(orbits, st.floats(0.01, 10))
+def test_a_point_on_a_pixels_ray_is_projected_to_that_pixel_at_its_depth(camera: Camera, distance: float) -> None:
+    rays = camera.rays()
+    torch.testing.assert_close(rays.directions.norm(dim=-1), torch.ones(rays.shape, dtype=f64))
+    distances = torch.full(rays.shape, distance, dtype=f64)
+    pixels, depth = camera.project(rays.at(distances))
+    torch.testing.assert_close(pixels, camera.pixels())
+    torch.testing.assert_close(depth, camera.depth(distances))
+
+
+def test_depth_is_shorter_than_distance_by_the_cosine_of_the_angle() -> None:
+    camera = Camera.orbit(0, 0, 4, height=64, width=64, focal_px=32, dtype=f64)  # 90° from edge to edge
+    corner = camera.cosines(torch.tensor([[32.0, 32.0], [64.0, 32.0], [64.0, 64.0]], dtype=f64))
+    torch.testing.assert_close(corner, torch.tensor([1, 1 / math.sqrt(2), 1 / math.sqrt(3)], dtype=f64))
+    torch.testing.assert_close(camera.depth(torch.full((64, 64), 2.0, dtype=f64)), 2 * camera.cosines())
+
+
+def test_as_many_rays_of_the_posters_view_enter_the_sphere_as_published() -> None:
+    """122,172 by counting pixels within f / √(d² − 1) of the middle.
+
+    Eight of them graze the sphere closer than float32 tells: the published 122,166 counts two of those.
+    """
+    reach = 960**2 / (4.97**2 - 1)
+    counted = sum((x + 0.5) ** 2 + (y + 0.5) ** 2 < reach for x in range(-256, 256) for y in range(-256, 256))
+    for dtype in (torch.float32, f64):
+        rays = poster(dtype=dtype).rays()
+        assert meet_sphere(rays).meets.sum() == counted == 122_172
+    assert meet_sphere(rays, 1 - 2e-6).meets.sum() == counted - 8 <= 122_166 <= counted
+
+
+def test_the_tolerance_is_half_of_what_neighbouring_pixels_see() -> None:
+    """ε = d S cos²θ / (2 f R), 5e-5 for the paper's f = 60 mm, S = 32 mm, R = 512, d = 10 cm."""
+    tolerance = poster().tolerance(0.1)
+    assert tolerance.max() == pytest.approx(0.1 * 32 / (2 * 60 * 512), rel=1e-5)
+    assert tolerance.max() == pytest.approx(5e-5, rel=0.05)
+    torch.testing.assert_close(tolerance, 0.1 / (2 * 960) * poster().cosines() ** 2)
+
+
+@given(orbits, st.sampled_from([0.25, 0.5, 2.0, 3.0]))
+def test_a_resized_camera_sees_the_same_and_covers_every_pixel(camera: Camera, factor: float) -> None:
+    resized = camera.resized(factor)
+    assert resized.height >= camera.height * factor > resized.height - 1
+    assert resized.width >= camera.width * factor > resized.width - 1
+    there = resized.rays(camera.pixels() * factor)
+    torch.testing.assert_close(there.directions, camera.rays().directions)
+    torch.testing.assert_close(there.origins, camera.rays().origins)
+
+
+def test_cameras_in_a_batch_have_the_rays_of_each() -> None:
+    alone = [Camera.orbit(a, 10, 3 + a / 90, height=4, width=6, focal_mm=30 + a, dtype=f64) for a in (0, 45, 200)]
+    batch = Camera.from_matrices(
+        torch.stack([c.intrinsics for c in alone]), torch.stack([c.T_world_camera for c in alone]), 4, 6
+    )
+    assert batch.rays().shape == batch.cosines().shape == batch.tolerance(0.1).shape == (3, 4, 6)
+    for k, camera in enumerate(alone):
+        torch.testing.assert_close(batch.rays().directions[k], camera.rays().directions)
+        torch.testing.assert_close(batch.rays().origins[k], camera.rays().origins)
+        torch.testing.assert_close(batch.cosines()[k], camera.cosines())
+        torch.testing.assert_close(batch.tolerance(0.1)[k], camera.tolerance(0.1))
+        torch.testing.assert_close(batch.resized(0.5).rays().directions[k], camera.resized(0.5).rays().directions)
+
+
+def test_a_focal_length_in_pixels_is_the_one_in_millimetres() -> None:
+    in_mm = Camera.orbit(0, 0, 3, focal_mm=60, sensor_mm=32, height=10, width=64)
+    in_px = Camera.orbit(0, 0, 3, focal_px=120, height=10, width=64)
+    torch.testing.assert_close(in_mm.intrinsics, in_px.intrinsics)
+
+
+@pytest.mark.parametrize(
+    ("given", "repeated"),
+    [
+        (dict(distance=0), "its own place"),
+        (dict(distance=math.nan), "place"),
+        (dict(distance=math.inf), "not finite"),
+        (dict(height=0), "0 × 512"),
+        (dict(width=-3), "512 × -3"),
+        (dict(focal_mm=-35), "-35"),
+        (dict(focal_mm=math.inf), "inf"),
+        (dict(sensor_mm=0), "sensor of 0"),
+        (dict(focal_px=0), "length of 0"),
+        (dict(focal_px=-120), "-120"),
+    ],
+    ids=str,
+)
+def test_an_orbit_that_no_camera_can_have_is_refused_in_words(given: dict, repeated: str) -> None:
+    with pytest.raises(ValueError, match=repeated):
+        Camera.orbit(**{"azimuth": 30, "elevation": 20, "distance": 4.97, **given})
+
+
+K = torch.tensor([[100.0, 0, 32], [0, 100, 32], [0, 0, 1]])
+T = torch.tensor([[1.0, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, -3], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "pose", "repeated"),
+    [
+        (K[:2], T, r"\[2, 3\]"),
+        (K, T[:3], r"\[3, 4\]"),
+        (K, T.expand(5, 4, 4), r"\[5, 4, 4\]"),
+        (K.expand(2, 3, 3), T.expand(5, 4, 4), r"\[2, 3, 3\]"),
+        (K * torch.tensor([[-1.0], [1], [1]]), T, "-100"),
+        (K.where(K != 32, torch.nan), T, "not finite"),
+        (K.T, T, "intrinsics .* transposed"),
+        (K, T.T, "T_world_camera .* transposed"),
+        (K, T * torch.tensor([-1.0, 1, 1, 1]), "mirroring"),
+        (K, T * torch.tensor([2.0, 2, 2, 1]), "rotation"),
+    ],
+)
+def test_matrices_that_are_no_cameras_are_refused_in_words(
+    intrinsics: torch.Tensor, pose: torch.Tensor, repeated: str
+) -> None:
+    Camera.from_matrices(K, T, 64, 64)
+    with pytest.raises(ValueError, match=repeated):
+        Camera.from_matrices(intrinsics, pose, 64, 64)
+
+
+def test_an_image_without_pixels_is_refused() -> None:
+    with pytest.raises(ValueError, match="0 × 64"):
+        Camera.from_matrices(K, T, 0, 64)

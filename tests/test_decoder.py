@@ -1,0 +1,181 @@
+"""The decoder, against DeepSDF's forward pass written out in numpy (Park et al., CVPR 2019, and their own code)."""
+
+import numpy as np
+import pytest
+import torch
+from torch.func import functional_call
+
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.field import chunked
+
+torch.set_num_threads(1)
+
+PLAIN = NetworkSpecs(dims=(16, 17, 18, 19), code_length=5, latent_in=(2,), norm_layers=(0, 1, 2, 3))
+ARCHITECTURES = {
+    "as published": NetworkSpecs(dims=(24,) * 8, code_length=6, latent_in=(4,), norm_layers=tuple(range(8))),
+    "fed again at the last layer": NetworkSpecs(dims=(16, 16, 20), code_length=4, latent_in=(3,)),
+    "fed again twice": NetworkSpecs(dims=(16, 16, 20, 16), code_length=4, latent_in=(1, 3)),
+    "never fed again": NetworkSpecs(dims=(16, 16), code_length=4, latent_in=()),
+    "points in all layers": NetworkSpecs(dims=(16,) * 4, code_length=3, latent_in=(2,), xyz_in_all=True),
+    "two tanh": NetworkSpecs(dims=(16,) * 3, code_length=3, latent_in=(2,), use_tanh=True),
+    "layer norm": NetworkSpecs(dims=(16,) * 3, code_length=3, latent_in=(2,), norm_layers=(0, 2, 3), weight_norm=False),
+    "no norm": NetworkSpecs(dims=(16,) * 3, code_length=3, latent_in=(1,), norm_layers=(), weight_norm=False),
+    "weight norm on some": NetworkSpecs(dims=(16,) * 4, code_length=3, latent_in=(), norm_layers=(0, 2)),
+    "a single number as code": NetworkSpecs(dims=(16,) * 3, code_length=1, latent_in=(2,)),
+    "linear": NetworkSpecs(dims=(), code_length=2, latent_in=()),
+}
+
+
+def deepsdf(specs: NetworkSpecs, state: dict[str, np.ndarray], code: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """DeepSDF's own forward, point by point: code and point concatenated, nothing folded."""
+    given = np.concatenate([np.broadcast_to(code, (len(points), len(code))), points], axis=1)
+    x = given
+    last = len(specs.dims)
+    for layer in range(last + 1):
+        if layer in specs.latent_in:
+            x = np.concatenate([x, given], axis=1)
+        elif layer != 0 and specs.xyz_in_all:
+            x = np.concatenate([x, points], axis=1)
+        x = x @ layer_weight(state, layer).T + state[f"lin{layer}.bias"]
+        if layer == last and specs.use_tanh:
+            x = np.tanh(x)
+        if layer < last:
+            if layer in specs.norm_layers and not specs.weight_norm:
+                centred = x - x.mean(axis=1, keepdims=True)
+                x = centred / np.sqrt((centred**2).mean(axis=1, keepdims=True) + 1e-5)
+                x = x * state[f"bn{layer}.weight"] + state[f"bn{layer}.bias"]
+            x = np.maximum(x, 0)
+    return np.tanh(x)[:, 0]
+
+
+def layer_weight(state: dict[str, np.ndarray], layer: int) -> np.ndarray:
+    if f"lin{layer}.weight" in state:
+        return state[f"lin{layer}.weight"]
+    v = state[f"lin{layer}.parametrizations.weight.original1"]
+    return state[f"lin{layer}.parametrizations.weight.original0"] * v / np.linalg.norm(v, axis=1, keepdims=True)
+
+
+def randomised(specs: NetworkSpecs, seed: int = 0) -> Decoder:
+    """In float64 and eval mode, every parameter drawn: also those that start as ones and zeros."""
+    torch.manual_seed(seed)
+    decoder = Decoder(specs).double().eval()
+    for name, parameter in decoder.named_parameters():
+        deviation = parameter.shape[1] ** -0.5 if parameter.dim() == 2 and parameter.shape[1] > 1 else 0.5
+        around = 1.0 if name.endswith("original0") or name.startswith("bn") else 0.0
+        torch.nn.init.normal_(parameter, mean=around, std=deviation)
+    return decoder
+
+
+def arrays(decoder: Decoder) -> dict[str, np.ndarray]:
+    return {key: value.numpy() for key, value in decoder.state_dict().items()}
+
+
+@pytest.fixture(params=ARCHITECTURES, ids=lambda name: name.replace(" ", "-"))
+def decoder(request) -> Decoder:
+    return randomised(ARCHITECTURES[request.param])
+
+
+@pytest.fixture
+def points() -> torch.Tensor:
+    return torch.rand(40, 3, dtype=torch.float64, generator=torch.manual_seed(1)) * 2 - 1
+
+
+def a_code(decoder: Decoder, *batch: int) -> torch.Tensor:
+    return torch.randn(*batch, decoder.specs.code_length, dtype=torch.float64, generator=torch.manual_seed(2))
+
+
+def test_the_folded_field_is_deepsdf_s_forward(decoder, points):
+    code = a_code(decoder)
+    expected = deepsdf(decoder.specs, arrays(decoder), code.numpy(), points.numpy())
+    assert expected.std() > 1e-3
+    np.testing.assert_allclose(decoder.field(code)(points).detach(), expected, atol=1e-12)
+
+
+def test_forward_with_a_code_per_point_is_each_field_at_its_point(decoder, points):
+    codes = a_code(decoder, len(points))
+    each = [decoder.field(code)(point[None]) for code, point in zip(codes, points)]
+    torch.testing.assert_close(decoder(points, codes), torch.cat(each))
+
+
+def test_forward_with_a_code_per_shape_is_each_shape_s_field(decoder, points):
+    codes, batch = a_code(decoder, 4), points.reshape(4, 10, 3)
+    each = [decoder.field(code)(points) for code, points in zip(codes, batch)]
+    torch.testing.assert_close(decoder(batch, codes[:, None]), torch.stack(each))
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (5, 4, 2)])
+def test_values_have_the_points_batch_axes(batch, points):
+    decoder = randomised(PLAIN)
+    field = decoder.field(a_code(decoder))
+    given = points[: int(np.prod(batch))].reshape(*batch, 3)
+    assert field(given).shape == batch
+    torch.testing.assert_close(field(given).flatten(), field(given.reshape(-1, 3)))
+
+
+def test_chunks_change_nothing(decoder, points):
+    code = a_code(decoder)
+    whole = decoder(points, code)
+    for size in (1, 7, 39, 40, 1000):
+        torch.testing.assert_close(chunked(decoder.field(code), size)(points.reshape(4, 10, 3)).flatten(), whole)
+
+
+def test_more_points_than_a_chunk_are_as_good_as_few(monkeypatch, points):
+    decoder = randomised(PLAIN)
+    code = a_code(decoder)
+    whole = decoder.field(code)(points)
+    monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+    torch.testing.assert_close(decoder.field(code)(points), whole)
+
+
+def test_gradients_agree_with_finite_differences_in_code_and_points(decoder, points):
+    code = a_code(decoder).requires_grad_()
+    points = points[:5].requires_grad_()
+    assert torch.autograd.gradcheck(lambda code, points: decoder.field(code)(points), (code, points))
+    assert torch.autograd.gradcheck(decoder, (points, code))
+
+
+def test_gradients_agree_with_finite_differences_in_the_weights(decoder, points):
+    code, used = a_code(decoder), {}
+    for name, parameter in decoder.named_parameters():
+        if name != f"bn{decoder.depth - 1}.weight" and name != f"bn{decoder.depth - 1}.bias":
+            used[name] = parameter
+
+    def values(*weights):
+        return functional_call(decoder, dict(zip(used, weights)), (points[:3], code))
+
+    assert torch.autograd.gradcheck(values, tuple(used.values()), fast_mode=True)
+
+
+def test_gradients_reach_the_weights_through_a_field(points):
+    decoder = randomised(PLAIN)
+    code = a_code(decoder)
+    through_field = torch.autograd.grad(decoder.field(code)(points).sum(), list(decoder.parameters()))
+    through_forward = torch.autograd.grad(decoder(points, code).sum(), list(decoder.parameters()))
+    torch.testing.assert_close(through_field, through_forward)
+
+
+def test_dropout_acts_in_training_alone(points):
+    decoder = randomised(NetworkSpecs(dims=(64,) * 2, code_length=3, latent_in=(), dropout=(0, 1), dropout_prob=0.5))
+    code = a_code(decoder)
+    torch.testing.assert_close(decoder(points, code), decoder(points, code), rtol=0, atol=0)
+    decoder.train()
+    assert not torch.equal(decoder(points, code), decoder(points, code))
+
+
+def test_a_code_of_another_length_is_named():
+    with pytest.raises(ValueError, match=r"^a code of shape \[4\] was given; this decoder takes \[5\]$"):
+        Decoder(PLAIN).field(torch.zeros(4))
+
+
+@pytest.mark.parametrize(
+    ("specs", "complaint"),
+    [
+        (NetworkSpecs(dims=(16, -5), code_length=4, latent_in=()), r"a code of 4 and layers of \[16, -5, 1\] outputs"),
+        (NetworkSpecs(dims=(8, 16), code_length=8, latent_in=(1,)), r"layers of \[-3, 16, 1\] outputs"),
+        (NetworkSpecs(dims=(3, 3), code_length=4, latent_in=(), xyz_in_all=True), r"layers of \[0, 0, 1\] outputs"),
+        (NetworkSpecs(dims=(16,), code_length=0, latent_in=()), "a code of 0 and"),
+    ],
+)
+def test_a_network_without_room_is_refused(specs, complaint):
+    with pytest.raises(ValueError, match=complaint + ".* each must be at least 1$"):
+        Decoder(specs)

@@ -1,0 +1,57 @@
+"""Imports go downward only, and only the command line prints."""
+
+import ast
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).parents[1] / "src" / "distrace"
+ORDER = [
+    *("errors", "files", "rays", "pose", "camera"),
+    *("field", "primitives", "decoder", "checkpoint"),
+    *("trace", "pyramid", "lattice", "surface", "render", "shading"),
+    *("losses", "warp", "metrics", "mesh", "data", "targets"),
+    *("train", "resume", "fit", "fit_samples"),
+    *("bench", "evaluate", "page", "report", "viewer", "cli"),
+]
+SHELL = set(ORDER[ORDER.index("bench") :])
+FILES = {path.relative_to(SOURCE).with_suffix("").as_posix(): path for path in SOURCE.rglob("*.py")}
+TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
+PARTS = sorted({name.split("/")[0] for name in TREES} - {"__init__"})
+
+
+def imported(name: str) -> set[str]:
+    """The parts of distrace that a module imports; a name of the package itself counts as `__init__`."""
+    found: set[str] = set()
+    folder = ["distrace", *name.split("/")[:-1]]
+    for node in ast.walk(TREES[name]):
+        paths: list[str] = []
+        if isinstance(node, ast.Import):
+            paths = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = folder[: len(folder) - node.level + 1] if node.level else []
+            base = ".".join([*above, *([node.module] if node.module else [])])
+            paths = [f"{base}.{alias.name}" for alias in node.names]
+        inside = [path.split(".") for path in paths if path.split(".")[0] == "distrace"]
+        found |= {part[1] if len(part) > 1 and part[1] in PARTS else "__init__" for part in inside}
+    return found
+
+
+def prints(name: str) -> bool:
+    return any(isinstance(node, ast.Name) and node.id == "print" for node in ast.walk(TREES[name]))
+
+
+@pytest.mark.parametrize("name", sorted(TREES))
+def test_imports_go_downward_and_nothing_imports_the_shell(name: str) -> None:
+    part = name.split("/")[0]
+    if part == "__init__":
+        assert not imported(name) & SHELL
+        return
+    assert part in ORDER, "a new module needs a place in the order"
+    below = set(ORDER[: ORDER.index(part)]) | ({part} if "/" in name else set())
+    allowed = below | {"__init__"} if part in SHELL else below - SHELL
+    assert imported(name) <= allowed
+
+
+def test_only_the_command_line_prints() -> None:
+    assert [name for name in TREES if prints(name) and name.split("/")[0] != "cli"] == []

@@ -1,0 +1,88 @@
+"""Triangles from a field."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from skimage.measure import marching_cubes
+
+from distrace import primitives
+from distrace.mesh import MeshConfig, extract_mesh
+
+COARSE = MeshConfig(resolution=48)
+
+
+def test_a_sphere_has_its_volume_and_area_and_is_closed() -> None:
+    mesh = extract_mesh(primitives.sphere(0.6), COARSE)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=5e-3)
+    assert mesh.area == pytest.approx(4 * math.pi * 0.6**2, rel=5e-3)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.6).max() < 1e-3
+
+
+def test_normals_point_out() -> None:
+    centre = torch.tensor([0.2, -0.1, 0.1])
+    mesh = extract_mesh(primitives.sphere(0.4, centre), COARSE)
+    outward = mesh.triangles_center - centre.numpy()
+    outward /= np.linalg.norm(outward, axis=1, keepdims=True)
+    sized = mesh.area_faces > 1e-8
+    assert (mesh.face_normals * outward).sum(axis=1)[sized].min() > 0.9
+
+
+def test_vertices_lie_where_the_field_is_zero_in_axes_of_the_world() -> None:
+    """Nothing is flipped or shifted: the box has another length along each axis, and a bump on one side."""
+    sdf = primitives.union(
+        primitives.box(torch.tensor([0.5, 0.3, 0.15])), primitives.sphere(0.2, torch.tensor([0.5, 0.3, 0.0]))
+    )
+    mesh = extract_mesh(sdf, MeshConfig(resolution=64))
+    cell = 2 / 64
+    assert sdf(torch.tensor(mesh.vertices).float()).abs().max() < cell / 4
+    np.testing.assert_allclose(mesh.bounds, [[-0.5, -0.3, -0.2], [0.7, 0.5, 0.2]], atol=cell / 2)
+
+
+def test_a_torus_keeps_its_hole() -> None:
+    mesh = extract_mesh(primitives.torus(0.5, 0.2), COARSE)
+    assert mesh.is_watertight
+    assert mesh.euler_number == 0
+
+
+def test_cells_are_passed_over_only_where_there_is_no_surface() -> None:
+    """The same triangles as on the whole grid, from a fraction of its values."""
+    asked = 0
+    thin = primitives.box(torch.tensor([0.71, 0.02, 0.43]))
+
+    def watched(points: torch.Tensor) -> torch.Tensor:
+        nonlocal asked
+        asked += len(points)
+        return thin(points)
+
+    mesh = extract_mesh(watched, MeshConfig(resolution=64))
+    ticks = torch.linspace(-1, 1, 65)
+    grid = thin(torch.cartesian_prod(ticks, ticks, ticks)).reshape(65, 65, 65).numpy()
+    vertices, faces, _, _ = marching_cubes(grid, 0.0)
+    assert len(mesh.faces) == len(faces)
+    np.testing.assert_allclose(np.sort(mesh.vertices, axis=0), np.sort(vertices / 32 - 1, axis=0), atol=1e-5)
+    assert asked < 65**3 / 4
+
+
+def test_a_larger_cube_holds_a_larger_shape() -> None:
+    mesh = extract_mesh(primitives.sphere(1.5), MeshConfig(resolution=48, radius=2.0))
+    assert mesh.volume == pytest.approx(4 / 3 * math.pi * 1.5**3, rel=1e-2)
+
+
+@pytest.mark.parametrize(
+    "sdf",
+    [primitives.sphere(0.3, torch.tensor([0, 9.0, 0])), primitives.sphere(9.0), lambda p: 0.01 + 0 * p[..., 0]],
+    ids=["elsewhere", "inside everywhere", "close to zero, but nowhere zero"],
+)
+def test_a_field_without_a_surface_is_told_so(sdf) -> None:
+    with pytest.raises(ValueError, match=r"no zero within 1\.0 of the origin"):
+        extract_mesh(sdf, MeshConfig(resolution=16))
+
+
+@pytest.mark.parametrize("resolution", [0, 4, 20, -8])
+def test_a_resolution_that_cannot_be_halved_is_refused(resolution: int) -> None:
+    with pytest.raises(ValueError, match=f"resolution of {resolution}"):
+        MeshConfig(resolution=resolution)

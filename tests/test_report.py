@@ -1,0 +1,230 @@
+"""The page of a completion, read back as a browser would."""
+
+import base64
+import io
+import json
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+
+from distrace import page, report
+from distrace.camera import Camera
+from distrace.metrics import Chamfer
+from distrace.primitives import sphere
+from distrace.render import render
+from distrace.report import Completion, View, completion_page
+
+VOID = {"meta", "link", "img", "br", "path", "use"}
+
+
+class Reader(HTMLParser):
+    """Tags with their attributes, the text between them, the contents of scripts; fails where tags do not close."""
+
+    def __init__(self, page: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str]]] = []
+        self.text, self.scripts, self.open = "", [], []
+        self.feed(page)
+        self.close()
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attributes}))
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, {name: value or "" for name, value in attributes}))
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in VOID:
+            assert self.open.pop() == tag
+
+    def handle_data(self, text: str) -> None:
+        if self.open and self.open[-1] == "script":
+            self.scripts.append(text)
+        elif self.open and self.open[-1] != "style":
+            self.text += text + "\n"
+
+    def all(self, tag: str) -> list[dict[str, str]]:
+        return [attributes for name, attributes in self.tags if name == tag]
+
+
+def view(radius: float) -> View:
+    with torch.no_grad():
+        return View.of(render(sphere(radius), Camera.orbit(30, 20, 4.0, height=48, width=48)))
+
+
+@pytest.fixture(scope="module")
+def completion() -> Completion:
+    before, after, truth = view(0.8), view(0.62), view(0.6)
+    depth = np.full((48, 48), np.inf, dtype=np.float32)
+    depth[20:28:3, 20:28:3] = truth.depth[20:28:3, 20:28:3]
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.62)
+    points = np.asarray(mesh.vertices)
+    return Completion(
+        title="Sphere <b>&</b> co",
+        observed_depth=depth,
+        observed_mask=truth.mask,
+        points_world=points[:9],
+        before=before,
+        after=after,
+        truth=truth,
+        losses={"start 1": [1.0, 0.5], "start 2": [0.9, 0.1, 0.01]},
+        mesh=mesh,
+        truth_points=points * 0.6 / 0.62,
+        chamfer=Chamfer(to=0.1234, from_=0.5678),
+        facts={"model": "<script>alert(1)</script>", "seconds": "12.5"},
+        chosen="start 2",
+    )
+
+
+@pytest.fixture(scope="module")
+def page(completion: Completion) -> str:
+    return completion_page(completion)
+
+
+@pytest.fixture(scope="module")
+def read(page: str) -> Reader:
+    return Reader(page)
+
+
+def scene_of(read: Reader) -> dict:
+    return json.loads(next(script for script in read.scripts if script.startswith("{")))
+
+
+def test_every_tag_that_opens_closes(read: Reader) -> None:
+    assert read.open == []
+
+
+def test_the_page_refers_to_nothing_outside_itself(read: Reader) -> None:
+    for tag, attributes in read.tags:
+        for name in ("src", "href", "xlink:href", "srcset", "action", "data"):
+            assert attributes.get(name, "data:").startswith(("data:", "#")), (tag, name)
+        assert "url(http" not in attributes.get("style", "")
+    own = [script for script in read.scripts if len(script) < 1_000_000]
+    assert own
+    assert not any(re.search(r"https?://", script) for script in own)
+
+
+def test_the_page_forbids_the_browser_to_load_anything(read: Reader) -> None:
+    policy = next(tag["content"] for tag in read.all("meta") if tag.get("http-equiv") == "Content-Security-Policy")
+    assert "default-src 'none'" in policy
+    assert "http" not in policy
+
+
+def test_what_the_user_wrote_is_text_and_not_markup(page: str, read: Reader) -> None:
+    assert "Sphere <b>&</b> co" in read.text
+    assert "<script>alert(1)</script>" in read.text
+    assert "<script>alert" not in page
+    assert not read.all("b")
+
+
+def test_markup_in_captions_cells_and_names_of_curves_and_clouds_stays_text() -> None:
+    evil = '"><script>alert("$x")</script>'
+    mesh = trimesh.creation.icosphere(subdivisions=1)
+    blocks = [
+        report.figure(np.zeros((2, 2, 3), np.uint8), evil),
+        report.table((evil,), [(evil,)]),
+        report.curves({evil: [1.0, 2.0]}, evil, evil, log=False, emphasised=evil),
+        report.scene({evil: mesh}, {evil: np.zeros((1, 3))}),
+        report.key({evil: (0, 0, 0)}),
+        report.paragraph(evil),
+        report.section(evil),
+    ]
+    for block in blocks:
+        assert "<script>alert" not in block
+        Reader(block)
+
+
+def test_each_part_has_its_heading(read: Reader) -> None:
+    for part in (
+        "Observed",
+        "Shape",
+        "In space",
+        "Distance to the truth",
+        "Silhouettes",
+        "Depth",
+        "Normals",
+        "Loss",
+        "Facts",
+    ):
+        assert f"\n{part}\n" in read.text, part
+
+
+def test_every_picture_is_a_png_with_a_caption(read: Reader) -> None:
+    pictures = read.all("img")
+    assert len(pictures) == 2 + 3 + 2 + 3 + 2 + 3
+    for picture in pictures:
+        encoded = picture["src"].removeprefix("data:image/png;base64,")
+        image = Image.open(io.BytesIO(base64.b64decode(encoded)))
+        assert image.size == (int(picture["width"]), int(picture["height"]))
+        assert picture["alt"] in read.text
+
+
+def test_both_directions_of_the_chamfer_distance_are_told_with_their_unit(read: Reader) -> None:
+    for told in ("0.1234", "0.5678", "0.6912", "× 1000", "30,000 points", "surface is missing", "should not be there"):
+        assert told in read.text, told
+
+
+def test_the_curves_have_their_names_and_the_chosen_start_is_told(read: Reader) -> None:
+    assert "start 1" in read.text
+    assert "The shape shown is that of start 2." in read.text
+    assert len(read.all("svg")) == 1
+
+
+def test_the_axes_of_curves_take_the_colour_of_the_page() -> None:
+    drawn = report.curves({"a": [1.0, 2.0]}, "step", "loss", log=True)
+    assert "currentColor" in drawn
+    assert report.THEME_INK not in drawn
+
+
+def test_the_scene_holds_the_surface_the_observed_points_and_the_truth(read: Reader, completion: Completion) -> None:
+    surface, observed, truth = scene_of(read)["data"]
+    assert [surface["type"], observed["type"], truth["type"]] == ["mesh3d", "scatter3d", "scatter3d"]
+    up = np.frombuffer(base64.b64decode(observed["z"]["bdata"]), observed["z"]["dtype"])  # plotly's z is up
+    assert np.allclose(up, completion.points_world[:, 1])
+
+
+def test_plotly_is_inlined_once_and_only_where_something_turns(read: Reader) -> None:
+    assert sum(len(script) > 1_000_000 for script in read.scripts) == 1
+    still = report.page("Still", "No view", [report.section("Table", report.table(("a",), [("1",)]))])
+    assert len(still) < 10_000
+    assert not Reader(still).scripts
+
+
+def test_a_page_without_truth_or_silhouette_leaves_out_what_it_cannot_know(completion: Completion) -> None:
+    unknown = replace(completion, truth=None, truth_points=None, chamfer=None, observed_mask=None, chosen=None)
+    read = Reader(completion_page(unknown))
+    assert "Distance to the truth" not in read.text
+    assert "Truth" not in read.text
+    assert len(scene_of(read)["data"]) == 2
+    assert read.open == []
+
+
+def test_a_dense_observation_is_shown_as_depth_and_a_sparse_one_as_dots(completion: Completion) -> None:
+    dense = replace(completion, observed_depth=completion.after.depth)
+    assert "The observed depth" in Reader(completion_page(dense)).text
+    assert "The observed points, over" in Reader(completion_page(completion)).text
+
+
+def test_a_mesh_of_many_faces_is_thinned_but_keeps_its_form() -> None:
+    fine = trimesh.creation.icosphere(subdivisions=6, radius=0.7)
+    assert len(fine.faces) > report.MOST_FACES
+    surface = Reader(report.scene({"fine": fine}, {}))
+    drawn = json.loads(surface.scripts[0])["data"][0]
+    i = np.frombuffer(base64.b64decode(drawn["i"]["bdata"]), drawn["i"]["dtype"])
+    corners = np.stack([np.frombuffer(base64.b64decode(drawn[axis]["bdata"]), np.float32) for axis in "xyz"], axis=1)
+    assert 10_000 < len(i) <= report.MOST_FACES
+    assert np.abs(np.linalg.norm(corners, axis=1) - 0.7).max() < 0.01
+
+
+def test_columns_of_numbers_stand_to_the_right_and_columns_with_words_to_the_left() -> None:
+    drawn = Reader(report.table(("name", "value", "note"), [("chair", "0.25", "7"), ("sofa", "–", "seven")]))
+    assert [cell.get("class") for cell in drawn.all("td")] == [None, "number", None] * 2
+    assert [cell.get("class") for cell in drawn.all("th")] == [None, "number", None]
