@@ -41,7 +41,7 @@ def march(
         return Ended("ESCAPED", math.inf, 0)
     near, far = stretch
     t = near if start is None else min(max(start, near), far)
-    before = None
+    before, outside, inside = None, -math.inf, math.inf
     for evaluations in range(1, steps + 1):
         value = sdf(tuple(o + t * v for o, v in zip(origin, direction)))
         if abs(value) < tolerance:
@@ -49,7 +49,11 @@ def march(
         if value < 0 and t <= near:
             return Ended("INSIDE", math.inf, evaluations)
         before = t, value
+        inside = min(inside, t) if value < 0 else inside
+        outside = t if value > 0 and t < inside else outside
         t = max(t + step_scale * max(-step_limit, min(value, step_limit)), near)
+        if math.isfinite(outside) and math.isfinite(inside) and not outside < t < inside:
+            t = (outside + inside) / 2
         if t > far:
             return Ended("ESCAPED", math.inf, evaluations)
     return Ended("EXHAUSTED", math.inf, steps)
@@ -74,6 +78,10 @@ def box(half_extents: Vector) -> Field:
         return math.hypot(*(max(b, 0.0) for b in beyond)) + min(max(beyond), 0.0)
 
     return field
+
+
+def steeper(field: Field, factor: float) -> Field:
+    return lambda p: factor * field(p)
 
 
 def union(*fields: Field) -> Field:

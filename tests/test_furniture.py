@@ -203,9 +203,7 @@ def test_an_out_that_is_a_file_is_refused(deb):
     ],
 )
 def test_the_category_follows_from_the_name(tmp_path, name, tags, category):
-    members = OTHER | {
-        "PluginFurnitureCatalog.properties": f"name#1={name}\ntags#1={tags}\nmodel#1=/other/lamp.obj\n"
-    }
+    members = OTHER | {"PluginFurnitureCatalog.properties": f"name#1={name}\ntags#1={tags}\nmodel#1=/other/lamp.obj\n"}
     path = write_deb(tmp_path / "a.deb", {"sweethome3d/furniture/A.sh3f": shelf(members)})
     assert catalogue(path, tmp_path / "out")[0].category == category
 

@@ -22,16 +22,26 @@ def test_images_of_any_size_have_a_start_for_every_pixel(height: int, width: int
     start, _ = pyramid.starts(sphere, camera, 1.0, replace(COARSE_TO_FINE, coarse_levels=levels))
     assert start.shape == (height, width)
     assert not start.isnan().any()
-    assert (start[height // 2, width // 2] > 3.97) == (width > 1)  # one pixel's coarse ray passes by its corner
 
 
-def test_a_start_is_where_its_coarse_ray_stood() -> None:
-    """With one level and one step: at the near bound and 1.5 · 0.1 beyond, the same for the four pixels of each."""
+@pytest.mark.parametrize("levels", [1, 2, 3])
+@pytest.mark.parametrize("size", [12, 24, 33, 64])
+def test_every_ray_that_hits_a_sphere_hits_it_from_its_start(size: int, levels: int) -> None:
+    camera = Camera.orbit(30, 20, 4.97, height=size, width=size, dtype=f64)
+    seen = render(sphere, camera, config=replace(COARSE_TO_FINE, coarse_levels=levels, steps=100))
+    assert (seen.mask == meet_sphere(camera.rays(), 0.5).meets).all()
+
+
+def test_a_start_is_where_its_coarse_ray_stood_less_half_its_pixel() -> None:
+    """With one level and one step: 1.5 · 0.1 beyond the near bound, the same for the four pixels of each."""
     camera = Camera.orbit(30, 20, 4.97, height=32, width=32, dtype=f64)
     config = replace(COARSE_TO_FINE, coarse_levels=1, coarse_steps=1)
     start, evaluations = pyramid.starts(sphere, camera, 1.0, config)
-    bounds = meet_sphere(camera.resized(0.5).rays())
-    stood = torch.where(bounds.near + 0.15 < bounds.far, bounds.near + 0.15, -torch.inf)
+    coarse = camera.resized(0.5)
+    bounds = meet_sphere(coarse.rays())
+    half_diagonal = 2**0.5 * coarse.tolerance(1.0) * bounds.far
+    assert half_diagonal[bounds.meets].max() < 0.2
+    stood = torch.where(bounds.near + 0.15 < bounds.far, bounds.near + 0.15 - half_diagonal, -torch.inf)
     assert evaluations == bounds.meets.sum()
     torch.testing.assert_close(start, stood.repeat_interleave(2, 0).repeat_interleave(2, 1))
 

@@ -125,8 +125,8 @@ def test_a_box_seen_face_on_has_finite_gradients_of_its_normals() -> None:
     assert by_size[2].item() == pytest.approx(-buffers.mask.sum().item(), rel=1e-3)
 
 
-def test_the_gradient_of_an_image_is_that_of_its_closed_form() -> None:
-    """Of a mean over all hits, to the focal length and the radius at once."""
+def test_the_gradients_of_images_are_those_of_their_closed_forms() -> None:
+    """To the focal length and the radius at once; the normal's, through the point, too."""
     camera = view(16)
     focal = torch.tensor(camera.intrinsics[0, 0].item(), dtype=f64, requires_grad=True)
     radius = torch.tensor(0.5, dtype=f64, requires_grad=True)
@@ -134,12 +134,22 @@ def test_the_gradient_of_an_image_is_that_of_its_closed_form() -> None:
     intrinsics = intrinsics + camera.intrinsics * torch.tensor([[0, 0, 1.0], [0, 0, 1], [0, 0, 0]])
     zoomed = replace(camera, intrinsics=intrinsics)
     buffers = render(primitives.sphere(radius), zoomed, config=EXACT)
-    rays = zoomed.rays()[buffers.mask]
+    hit, missed = buffers.mask, ~buffers.mask & meet_sphere(zoomed.rays().detach()).meets
+    rays = zoomed.rays()
     b = (rays.origins * rays.directions).sum(-1)
-    true = (-b - (b**2 - 4.97**2 + radius**2).sqrt()) * zoomed.cosines()[buffers.mask]
-    torch.testing.assert_close(buffers.depth[buffers.mask], true, rtol=0, atol=1e-6)
-    found = torch.autograd.grad(buffers.depth[buffers.mask].mean(), (focal, radius), retain_graph=True)
-    torch.testing.assert_close(found, torch.autograd.grad(true.mean(), (focal, radius)), rtol=1e-6, atol=0)
+    true = -b[hit] - (b[hit] ** 2 - 4.97**2 + radius**2).sqrt()
+    passes = torch.linalg.cross(rays.origins, rays.directions)[missed].norm(dim=-1)
+    right = camera.T_world_camera[:3, 0]  # in the mean a normal's part that way is zero, but not its size
+    for image, exact in (
+        (buffers.depth[hit], true * zoomed.cosines()[hit]),
+        (buffers.points, rays[hit].at(true)),
+        ((buffers.normal[hit] @ right).abs(), (rays[hit].at(true) @ right / radius).abs()),
+        (buffers.clearance[missed], passes - radius),
+    ):
+        torch.testing.assert_close(image, exact, rtol=0, atol=1e-6)
+        found = torch.autograd.grad(image.mean(), (focal, radius), retain_graph=True)
+        expected = torch.autograd.grad(exact.mean(), (focal, radius), retain_graph=True)
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-9)
 
 
 @every_strategy

@@ -13,7 +13,7 @@ import torch
 import trimesh
 from PIL import Image
 
-from distrace import page, report
+from distrace import page as html
 from distrace.camera import Camera
 from distrace.metrics import Chamfer
 from distrace.primitives import sphere
@@ -129,13 +129,13 @@ def test_markup_in_captions_cells_and_names_of_curves_and_clouds_stays_text() ->
     evil = '"><script>alert("$x")</script>'
     mesh = trimesh.creation.icosphere(subdivisions=1)
     blocks = [
-        report.figure(np.zeros((2, 2, 3), np.uint8), evil),
-        report.table((evil,), [(evil,)]),
-        report.curves({evil: [1.0, 2.0]}, evil, evil, log=False, emphasised=evil),
-        report.scene({evil: mesh}, {evil: np.zeros((1, 3))}),
-        report.key({evil: (0, 0, 0)}),
-        report.paragraph(evil),
-        report.section(evil),
+        html.figure(np.zeros((2, 2, 3), np.uint8), evil),
+        html.table((evil,), [(evil,)]),
+        html.curves({evil: [1.0, 2.0]}, evil, evil, log=False, emphasised=evil),
+        html.scene({evil: mesh}, {evil: np.zeros((1, 3))}),
+        html.key({evil: (0, 0, 0)}),
+        html.paragraph(evil),
+        html.section(evil),
     ]
     for block in blocks:
         assert "<script>alert" not in block
@@ -179,9 +179,9 @@ def test_the_curves_have_their_names_and_the_chosen_start_is_told(read: Reader) 
 
 
 def test_the_axes_of_curves_take_the_colour_of_the_page() -> None:
-    drawn = report.curves({"a": [1.0, 2.0]}, "step", "loss", log=True)
+    drawn = html.curves({"a": [1.0, 2.0]}, "step", "loss", log=True)
     assert "currentColor" in drawn
-    assert report.THEME_INK not in drawn
+    assert html.THEME_INK not in drawn
 
 
 def test_the_scene_holds_the_surface_the_observed_points_and_the_truth(read: Reader, completion: Completion) -> None:
@@ -193,7 +193,7 @@ def test_the_scene_holds_the_surface_the_observed_points_and_the_truth(read: Rea
 
 def test_plotly_is_inlined_once_and_only_where_something_turns(read: Reader) -> None:
     assert sum(len(script) > 1_000_000 for script in read.scripts) == 1
-    still = report.page("Still", "No view", [report.section("Table", report.table(("a",), [("1",)]))])
+    still = html.page("Still", "No view", [html.section("Table", html.table(("a",), [("1",)]))])
     assert len(still) < 10_000
     assert not Reader(still).scripts
 
@@ -215,16 +215,16 @@ def test_a_dense_observation_is_shown_as_depth_and_a_sparse_one_as_dots(completi
 
 def test_a_mesh_of_many_faces_is_thinned_but_keeps_its_form() -> None:
     fine = trimesh.creation.icosphere(subdivisions=6, radius=0.7)
-    assert len(fine.faces) > report.MOST_FACES
-    surface = Reader(report.scene({"fine": fine}, {}))
+    assert len(fine.faces) > html.MOST_FACES
+    surface = Reader(html.scene({"fine": fine}, {}))
     drawn = json.loads(surface.scripts[0])["data"][0]
     i = np.frombuffer(base64.b64decode(drawn["i"]["bdata"]), drawn["i"]["dtype"])
     corners = np.stack([np.frombuffer(base64.b64decode(drawn[axis]["bdata"]), np.float32) for axis in "xyz"], axis=1)
-    assert 10_000 < len(i) <= report.MOST_FACES
+    assert 10_000 < len(i) <= html.MOST_FACES
     assert np.abs(np.linalg.norm(corners, axis=1) - 0.7).max() < 0.01
 
 
 def test_columns_of_numbers_stand_to_the_right_and_columns_with_words_to_the_left() -> None:
-    drawn = Reader(report.table(("name", "value", "note"), [("chair", "0.25", "7"), ("sofa", "–", "seven")]))
+    drawn = Reader(html.table(("name", "value", "note"), [("chair", "0.25", "7"), ("sofa", "–", "seven")]))
     assert [cell.get("class") for cell in drawn.all("td")] == [None, "number", None] * 2
     assert [cell.get("class") for cell in drawn.all("th")] == [None, "number", None]

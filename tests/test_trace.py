@@ -64,19 +64,19 @@ class Watched:
 
 
 @every_strategy
-@pytest.mark.parametrize("steps", [4, 50])
-def test_every_ray_ends_as_it_does_alone_in_plain_python(config: TraceConfig, steps: int) -> None:
+@pytest.mark.parametrize(("steps", "slope"), [(4, 1.0), (50, 1.0), (50, 3.0)])
+def test_every_ray_ends_as_it_does_alone_in_plain_python(config: TraceConfig, steps: int, slope: float) -> None:
     camera, config = view(), replace(config, steps=steps)
-    rays = camera.rays()
-    start = pyramid.starts(scene, camera, 1.0, config)[0] if config.coarse_levels else None
-    traced = trace(scene, rays, config, start)
+    rays, field = camera.rays(), lambda points: slope * scene(points)
+    start = pyramid.starts(field, camera, 1.0, config)[0] if config.coarse_levels else None
+    traced = trace(field, rays, config, start)
     rule = dict(
         steps=steps, step_scale=config.step_scale, step_limit=config.step_limit, tolerance=float(config.tolerance)
     )
     begins = [None] * (24 * 24) if start is None else start.flatten().tolist()
     flat = rays.flat()
     alone = [
-        reference.march(slow_scene, tuple(origin), tuple(direction), **rule, start=begin)
+        reference.march(reference.steeper(slow_scene, slope), tuple(origin), tuple(direction), **rule, start=begin)
         for origin, direction, begin in zip(flat.origins.tolist(), flat.directions.tolist(), begins)
     ]
     assert [Outcome(k).name for k in traced.outcome.flatten().tolist()] == [end.outcome for end in alone]
@@ -240,12 +240,31 @@ def test_a_ray_goes_on_from_where_it_is_started() -> None:
     assert overshot.distance.item() == pytest.approx(2.5, abs=1e-5)
 
 
+@pytest.mark.parametrize("off", [4e-5, -4e-5])
+def test_a_ray_that_starts_within_the_tolerance_is_moved_on_by_the_value(off: float) -> None:
+    """It has no secant; on a ray that looks straight at the surface the value is what is left."""
+    traced = trace(primitives.sphere(0.5), ray([0, 0, 3], [0, 0, -1]), start=torch.tensor([2.5 + off], dtype=f64))
+    assert traced.evaluations.item() == 1
+    assert traced.distance.item() == pytest.approx(2.5, abs=1e-12)
+
+
+def test_a_ray_is_not_followed_back_out_of_its_bounds() -> None:
+    """The surface lies 0.05 before the bounds; a step back from 0.05 behind them would meet it."""
+    watched = Watched(primitives.plane(torch.tensor([0, 0, 1], dtype=f64), 1.05))
+    traced = trace(watched, ray([0, 0, 3], [0, 0, -1]), start=torch.tensor([2.05], dtype=f64))
+    assert traced.outcome.item() == Outcome.INSIDE
+    assert torch.cat(watched.asked)[:, 2].tolist() == pytest.approx([0.95, 1.0])
+
+
 def test_closest_is_the_sample_of_least_value() -> None:
     rays, watched = ray([0, 0.7, 3], [0, 0, -1]), Watched(primitives.sphere(0.5))
     traced = trace(watched, rays)
     asked = torch.cat(watched.asked)
     least = asked[watched.sdf(asked).abs().argmin()]
     torch.testing.assert_close(rays.at(traced.closest)[0], least)
+    across = trace(primitives.sphere(0.45), ray([0, 0, 3], [0, 0, -1]), replace(AGGRESSIVE, step_scale=2.5, steps=4))
+    assert across.outcome.item() == Outcome.EXHAUSTED  # at −0.075, after +0.05
+    assert across.closest.item() == pytest.approx(2.5)
 
 
 def test_a_tolerance_per_ray_is_kept_per_ray() -> None:
@@ -300,6 +319,26 @@ def test_by_default_a_sphere_is_right_to_a_hundredth_of_the_tolerance() -> None:
     assert error.mean() < 1e-6
     assert error.max() < 1e-4
     assert (traced.hit != true.meets).sum() <= 0.01 * true.meets.sum()
+
+
+@pytest.mark.parametrize("slope", [2.5, 4.0, 10.0])
+def test_a_field_too_steep_for_its_steps_is_hit_all_the_same(slope: float) -> None:
+    """Where step_scale · |f'| > 2 each step lands farther from the surface than the last, but for the bracket."""
+    rays = view().rays()
+    traced = trace(lambda points: slope * (points.norm(dim=-1) - 0.5), rays, replace(AGGRESSIVE, steps=100))
+    facing = meet_sphere(rays, 0.4).meets
+    assert traced.hit[facing].all()
+    error = (traced.distance - meet_sphere(rays, 0.5).near)[facing].abs()
+    assert error.max() < 1e-5
+
+
+def test_without_polish_a_hit_is_a_sample() -> None:
+    rays, watched = ray([0.2, 0.1, 3], [0, 0, -1]), Watched(primitives.sphere(0.5))
+    traced = trace(watched, rays, replace(AGGRESSIVE, polish=False))
+    assert (watched.asked[-1] == rays.at(traced.distance)).all()
+    true = meet_sphere(rays, 0.5).near
+    assert 0 < (traced.distance - true).abs() < 1e-4
+    assert (trace(watched, rays).distance - true).abs() < 1e-7
 
 
 def test_a_trace_carries_no_gradient() -> None:

@@ -165,6 +165,8 @@ def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:
     focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
     if not (focal > 0).all():
         raise ValueError(f"focal lengths of {focal.tolist()} pixels were given; they must be positive")
+    if not (torch.linalg.det(intrinsics.detach()).abs() > 1e-6 * focal.prod(-1)).all():
+        raise ValueError(f"the intrinsics {intrinsics.tolist()} have no inverse; they map camera axes to pixels")
     rotation = T_world_camera.detach()[..., :3, :3].double()
     error = (
         (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()

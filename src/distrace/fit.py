@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import islice
 
 import torch
 from jaxtyping import Float
@@ -18,21 +19,28 @@ from distrace.render import render_rays
 from distrace.targets import Pool, Targets
 from distrace.trace import TraceConfig
 
+LEAST_DEVIATION = 0.4  # of the mean one: on held-out sofas better than none and no worse than 1
+
 
 @dataclass(frozen=True)
 class FitConfig:
     """Adam on the code, its rate falling to zero along a cosine."""
 
     iterations: int = 200
-    learning_rate: float = 0.05  # in standard deviations of the training codes
+    learning_rate: float = 0.1  # in standard deviations of the training codes
     depth_rays: int = 1000  # of each view at each iteration
     mask_rays: int = 500
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
     starts: int = 4
     trial: int = 25  # iterations that every start is given before the best goes on alone
-    trace: TraceConfig = field(default_factory=lambda: TraceConfig(coarse_levels=0))
+    trace: TraceConfig = field(default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=5e-4))
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.iterations < 1 or self.starts < 1:
+            given = f"{self.iterations} iterations and {self.starts} starts"
+            raise ValueError(f"{given} were asked for; both must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -60,13 +68,18 @@ class Step:
 
 
 def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
-    """The Gaussian of some training codes; of fewer than two, DeepSDF's N(0, 0.1²)."""
+    """The Gaussian of some training codes; of fewer than two, DeepSDF's N(0, 0.1²).
+
+    Directions in which the training codes hardly differ keep a small deviation: shapes that were not trained on need them.
+    """
+    length = codes.shape[1]
     if len(codes) < 2:
-        return Prior(torch.zeros_like(codes.mean(0)), 0.1 * torch.eye(codes.shape[1]))
+        return Prior(codes.new_zeros(length), 0.1 * torch.eye(length, device=codes.device))
     mean = codes.mean(0)
-    _, deviations, directions = torch.linalg.svd((codes - mean) / math.sqrt(len(codes) - 1), full_matrices=False)
-    kept = deviations > 1e-3 * deviations[0]
-    return Prior(mean, directions[kept].T * deviations[kept])
+    _, found, directions = torch.linalg.svd((codes - mean) / math.sqrt(len(codes) - 1))
+    deviations = codes.new_zeros(length)
+    deviations[: len(found)] = found
+    return Prior(mean, directions.T * (deviations**2 + (LEAST_DEVIATION * found.mean()) ** 2).sqrt())
 
 
 def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig = FitConfig()) -> Iterator[Step]:
@@ -76,10 +89,11 @@ def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: Fit
     """
     if not views:
         raise ValueError("no view was given; fitting needs at least one")
+    trial = min(config.trial, config.iterations - 1) if config.starts > 1 else 0  # the best has a step left to go on
     runs, trials = [], []
     for start in range(config.starts):
         run = _descend(decoder, views, prior, config, start)
-        for step in _first(run, config.trial if config.starts > 1 else 0):
+        for step in islice(run, trial):
             yield step
             trials.append(step)
         runs.append(run)
@@ -91,11 +105,6 @@ def _best(trials: list[Step]) -> int:
     starts = {step.start for step in trials}
     recent = {start: [step.loss for step in trials if step.start == start][-8:] for start in starts}
     return min(starts, key=lambda start: sum(recent[start]) / len(recent[start]))
-
-
-def _first(run: Iterator[Step], count: int) -> Iterator[Step]:
-    for _ in range(count):
-        yield next(run)
 
 
 def _descend(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig, start: int) -> Iterator[Step]:

@@ -18,21 +18,23 @@ def starts(
 ) -> tuple[Float[Tensor, "*batch height width"], int]:
     """Distances at which the rays of an image may start, and the evaluations that this took.
 
-    Each level marches `coarse_steps` and hands its distances to four rays each. A ray whose coarse one missed or
-    left the bounds starts afresh; depth is never taken from a coarse ray.
+    Each level marches `coarse_steps` and hands its distances to four rays each. A coarse ray waits where the surface
+    comes nearer than its pixel is wide: its neighbours may hit what it passes by. One that missed or left the bounds
+    hands nothing on. Depth is never taken from a coarse ray.
     """
-    distance, evaluations = None, 0
+    start, evaluations = None, 0
     for level in range(config.coarse_levels, 0, -1):
         coarse = camera.resized(0.5**level)
         rays = coarse.rays()
-        begin = None if distance is None else _split(distance, coarse)
-        few = replace(config, steps=config.coarse_steps, tolerance=float(torch.as_tensor(config.tolerance).min()))
-        trace = sphere_trace(sdf, rays, meet_sphere(rays, radius), few, begin)
+        bounds = meet_sphere(rays, radius)
+        reach = 2**0.5 * coarse.tolerance(1.0) * bounds.far  # half the diagonal of a pixel, where it is widest
+        few = replace(config, steps=config.coarse_steps, tolerance=reach.clamp_min(0), polish=False)
+        trace = sphere_trace(sdf, rays, bounds, few, None if start is None else _split(start, coarse))
         lost = (trace.outcome == Outcome.ESCAPED) | (trace.outcome == Outcome.INSIDE)
-        distance = torch.where(lost, -torch.inf, trace.stopped)
+        start = torch.where(lost, -torch.inf, trace.stopped - reach)
         evaluations += trace.total_evaluations
-    assert distance is not None
-    return _split(distance, camera), evaluations
+    assert start is not None
+    return _split(start, camera), evaluations
 
 
 def _split(distance: Float[Tensor, "*batch h w"], camera: Camera) -> Float[Tensor, "*batch height width"]:

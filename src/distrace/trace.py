@@ -24,11 +24,12 @@ class Outcome(IntEnum):
 class TraceConfig:
     """How rays are marched: t ← t + step_scale · f, until |f| < tolerance."""
 
-    steps: int = 50
+    steps: int = 100
     step_scale: float = 1.5  # above 1 is DIST's aggressive marching: the sign of f walks an overshoot back
     step_limit: float = 0.1  # f is clamped to ± this: decoders are trained on clamped distances and know no larger one
     tolerance: float | Float[Tensor, "*batch"] = 5e-5  # also per ray, as `Camera.tolerance` gives it
     compaction: bool = True  # only rays still on their way are queried; without, every ray at every step
+    polish: bool = True  # a ray that converged goes on to the zero of the secant through its last two samples
     coarse_levels: int = 2  # the march starts at 1 / 2^levels of the resolution …
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
 
@@ -37,7 +38,7 @@ class TraceConfig:
             raise ValueError(f"{self} cannot march: steps, step_scale and step_limit must be positive, and levels ≥ 0")
 
 
-PARALLEL = TraceConfig(step_scale=1.0, compaction=False, coarse_levels=0)
+PARALLEL = TraceConfig(steps=50, step_scale=1.0, compaction=False, coarse_levels=0)  # 50: as published
 DYNAMIC = replace(PARALLEL, compaction=True)
 AGGRESSIVE = replace(DYNAMIC, step_scale=1.5)
 COARSE_TO_FINE = replace(AGGRESSIVE, coarse_levels=2)
@@ -100,6 +101,8 @@ class _March:
     t: Tensor
     last_t: Tensor  # the sample before, for the secant
     last_value: Tensor
+    outside: Tensor  # the last sample with f > 0 before `inside`, for the bracket
+    inside: Tensor  # the first with f < 0
     least: Tensor  # |sdf| at `closest`
     closest: Tensor
     outcome: Tensor  # -1: still on its way
@@ -120,6 +123,8 @@ class _March:
             torch.where(meets, t, torch.inf),
             last_t=nothing,
             last_value=nothing.clone(),
+            outside=torch.full_like(near, -torch.inf),
+            inside=torch.full_like(near, torch.inf),
             least=torch.full_like(near, torch.inf),
             closest=torch.where(meets, t, torch.inf),
             outcome=torch.where(meets, -1, int(Outcome.ESCAPED)),
@@ -149,16 +154,29 @@ class _March:
         t, near, tolerance = self.t[at], self.near[at], self.tolerance[at]
         converged = value.abs() < tolerance
         inside = (t <= near) & (value < 0) & ~converged
-        following = (t + config.step_scale * value.clamp(-config.step_limit, config.step_limit)).maximum(near)
+        step = config.step_scale * value.clamp(-config.step_limit, config.step_limit)
+        following = self._bracketed(at, value, (t + step).maximum(near))
         escaped = (following > self.far[at]) & ~converged
         outcome = torch.full_like(self.outcome[at], -1)
         ends = ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT))
         for reached, name in (*ends, (value.isnan(), Outcome.EXHAUSTED)):
             outcome = outcome.masked_fill(reached, int(name))
         self.outcome[at] = outcome
-        polished = (t + self._to_zero(at, value)).clamp(near, self.far[at])
-        self.t[at] = torch.where(converged, polished, torch.where(outcome == -1, following, t))
+        end = (t + self._to_zero(at, value)).clamp(near, self.far[at]) if config.polish else t
+        self.t[at] = torch.where(converged, end, torch.where(outcome == -1, following, t))
         self.last_t[at], self.last_value[at] = t, value
+
+    def _bracketed(self, at: Tensor, value: Tensor, proposed: Tensor) -> Tensor:
+        """The proposed distance, or the middle of a sign change that it would jump out of.
+
+        Where step_scale · |f'| > 2 the march would bounce about the zero for ever.
+        """
+        t = self.t[at]
+        inside = torch.where(value < 0, t.minimum(self.inside[at]), self.inside[at])
+        outside = torch.where((value > 0) & (t < inside), t, self.outside[at])
+        self.inside[at], self.outside[at] = inside, outside
+        jumps = (inside < torch.inf) & (outside > -torch.inf) & ((proposed <= outside) | (proposed >= inside))
+        return torch.where(jumps, (outside + inside) / 2, proposed)
 
     def _to_zero(self, at: Tensor, value: Tensor) -> Tensor:
         """From a converged sample to the zero of the line through it and the one before; else by the value itself.

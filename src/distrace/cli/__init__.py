@@ -38,8 +38,10 @@ def main() -> None:
         _end("stopped; files written so far are whole, and train and sample go on from there", 130)
     except (ValueError, OSError) as error:
         _end(str(error), 2)
-    except torch.OutOfMemoryError as error:
-        _end(f"out of memory ({error}); use a smaller size, or --device cpu", 2)
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
+            raise
+        _end("there is not enough memory for that; use a smaller size, or --device cpu", 2)
 
 
 def _run(arguments: list[str]) -> None:
@@ -56,7 +58,7 @@ def _run(arguments: list[str]) -> None:
 
 def _one_line(box: str) -> str:
     """The parser's message without the box that it draws around it."""
-    words = re.sub(r"\x1b\[[0-9;]*m|[\u2500-\u257f]", " ", box).split()
+    words = re.sub(r"\x1b\[[0-9;]*m|[\u2500-\u257f]|-{4,}", " ", box).split()
     return " ".join(words).removeprefix("Parsing error ").removeprefix("Unrecognized options ")
 
 

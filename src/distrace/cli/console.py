@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
+from distrace.errors import explained
 from distrace.files import written
 
 console = Console()
@@ -49,10 +50,11 @@ def chosen_device(name: str) -> torch.device:
         raise ValueError(
             f"--device {name} was asked for, but this machine or this build of PyTorch has no CUDA; use cpu"
         )
-    try:
-        return torch.device(name)
-    except RuntimeError:
-        raise ValueError(f"--device {name} is no device; use auto, cpu or cuda") from None
+    with explained(f"--device {name} is no device; use auto, cpu or cuda"):
+        device = torch.device(name)
+    if device.type not in ("cpu", "cuda"):
+        raise ValueError(f"--device {name} is not supported; use auto, cpu or cuda")
+    return device
 
 
 def device_name(device: torch.device) -> str:

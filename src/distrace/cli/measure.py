@@ -86,6 +86,8 @@ class Evaluate:
 
 
 def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
+    if not results:
+        raise ValueError(f"{model} and the split have no shape in common that {name} is about; give a --split that has")
     rows = [result.row(model) for result in results]
     totals = summary(results)
     _show(rows)

@@ -30,7 +30,7 @@ class Render:
     sensor_mm: float = 32.0
     size: int = 512  # pixels along each side
     strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine"] = "coarse_to_fine"
-    steps: int = 50
+    steps: int = 100
     clearance: Flag = False  # also the least value of the field on each ray, which costs evaluations
     device: str = "cpu"
 

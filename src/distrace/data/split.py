@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 
+from distrace.errors import explained
+
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
 
 
@@ -24,17 +26,26 @@ class Shape:
 def read_split(name: str | Path) -> list[Shape]:
     """The shapes of a bundled split (`sofas`) or of a CSV file with the same columns.
 
-    Raises `ValueError` where there is no such split, or a column is missing.
+    Raises `ValueError` where there is no such split, or a column or a value is missing.
     """
     bundled = files("distrace") / "splits" / f"{name}.csv"
     source = bundled if bundled.is_file() else Path(name)
     if not source.is_file():
         raise ValueError(f"there is no split {name}: give the name of a bundled one (sofas) or a CSV file")
-    rows = csv.DictReader(source.read_text().splitlines())
-    missing = [column for column in Shape.__dataclass_fields__ if column not in (rows.fieldnames or [])]
+    with explained(f"the split {name} cannot be read as a CSV file"):
+        rows = csv.DictReader(source.read_text(encoding="utf-8").splitlines())
+        missing = [column for column in Shape.__dataclass_fields__ if column not in (rows.fieldnames or [])]
     if missing:
         raise ValueError(f"the split {name} lacks the columns {', '.join(missing)}")
-    return [Shape(**{**row, "turn": float(row["turn"])}) for row in rows]
+    with explained(f"the split {name} cannot be read: each row needs all of its columns, and degrees as its turn"):
+        return [_shape(row) for row in rows]
+
+
+def _shape(row: dict[str, str]) -> Shape:
+    known = {column: row[column] for column in Shape.__dataclass_fields__}
+    if None in known.values():
+        raise ValueError(f"{', '.join(filter(None, known.values()))} is too short")
+    return Shape(**{**known, "turn": float(row["turn"])})
 
 
 def every_mesh(folder: Path) -> list[Shape]:

@@ -2,7 +2,7 @@
 
     pip download --no-deps deepsdfstruct  # unit cells of lattices; Apache-2.0
     unzip deepsdfstruct-*.whl 'DeepSDFStruct/trained_models/*' -d out
-    python examples/05_other_peoples_models.py out/DeepSDFStruct/trained_models out
+    python examples/04_other_peoples_models.py out/DeepSDFStruct/trained_models out
 
 `load_model` knows the dialects. These decoders fill the cube [-1, 1]³, which no file tells: they are cut to it. The
 `primitives_cl…` decode 8 × 8 × 8 mirrored tiles, with a code that varies over space; `tiled` makes a field of them.

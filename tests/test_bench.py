@@ -1,0 +1,144 @@
+"""The benchmark: its reference against closed forms, and the table that it makes."""
+
+import math
+
+import pytest
+import torch
+
+from distrace.bench import LONG, Row, ablation, measured, poster_view, reference_distance
+from distrace.camera import Camera
+from distrace.field import Counted
+from distrace.primitives import box, capsule, sphere, union
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.render import Buffers, render
+from distrace.trace import STRATEGIES
+
+COLUMNS = ["strategy", "queries", "setup_queries", "seconds", "hits", "iou", "depth_mean", "depth_p99", "depth_max"]
+COLUMNS += ["outliers", "runs"]
+PUBLISHED = ("parallel", "dynamic", "aggressive", "coarse_to_fine")
+SOFA = union(
+    box(torch.tensor([0.7, 0.12, 0.3])),
+    capsule(torch.tensor([-0.6, 0.3, -0.25]), torch.tensor([0.6, 0.3, -0.25]), 0.15),
+)
+
+
+def test_the_posters_view_is_the_published_one() -> None:
+    view = poster_view()
+    entering = int(meet_sphere(view.rays()).meets.sum())
+    assert abs(entering - 122_166) <= 8, "as many graze the sphere closer than float32 tells: see test_camera"
+    assert view.T_world_camera[:3, 3].norm() == pytest.approx(4.97, abs=1e-5)
+
+
+def test_the_reference_is_the_closed_form_of_a_sphere() -> None:
+    rays = poster_view(32).rays()
+    expected = meet_sphere(rays, 0.8).near
+    found = reference_distance(sphere(0.8), rays, meet_sphere(rays))
+    assert torch.equal(torch.isfinite(found), torch.isfinite(expected))
+    hit = torch.isfinite(expected)
+    facing = -(rays.at(expected) * rays.directions).sum(-1)[hit] / 0.8
+    clear = facing > 0.2  # elsewhere float32's own rounding is more than that along the ray
+    assert clear.float().mean() > 0.9
+    assert (found - expected)[hit][clear].abs().max() < 2e-6
+
+
+def test_the_reference_finds_the_first_of_several_surfaces_and_none_where_there_is_none() -> None:
+    balls = union(sphere(0.2, torch.tensor([0.0, 0, 0.5])), sphere(0.2, torch.tensor([0.0, 0, -0.5])))
+    origins = torch.tensor([[0.0, 0, 2], [0.0, 0, 0], [0.0, 0.5, 2], [0.0, 3, 2]])
+    rays = Rays(origins, torch.tensor([0.0, 0, -1]).expand(4, 3))
+    found = reference_distance(balls, rays, meet_sphere(rays))
+    torch.testing.assert_close(found, torch.tensor([1.3, 0.3, math.inf, math.inf]), atol=2e-6, rtol=0)
+
+
+def test_the_reference_finds_a_sheet_that_longer_steps_would_pass() -> None:
+    """A field twice too steep, a sheet a hundredth thick."""
+    thin = box(torch.tensor([0.5, 0.5, 0.005]))
+    rays = Rays(torch.tensor([[0.1, 0.2, 2.0]]), torch.tensor([[0.0, 0, -1]]))
+    found = reference_distance(lambda points: 2 * thin(points), rays, meet_sphere(rays))
+    torch.testing.assert_close(found, torch.tensor([1.995]), atol=2e-6, rtol=0)
+
+
+def test_the_reference_ends_on_a_ray_along_which_the_field_only_comes_close_to_zero() -> None:
+    rays = Rays(torch.tensor([[0.0, 0.5, 2.0]]), torch.tensor([[0.0, 0, -1]]))
+    counted = Counted(sphere(0.5 - 1e-6))
+    assert reference_distance(counted, rays, meet_sphere(rays)) == torch.inf
+    assert counted.evaluations < 2 / 5e-5
+
+
+@pytest.fixture(scope="module")
+def table() -> list[tuple[Row, Buffers]]:
+    return list(ablation(SOFA, poster_view(64), STRATEGIES))
+
+
+def test_a_row_has_the_keys_of_the_contract(table: list[tuple[Row, Buffers]]) -> None:
+    for row, _ in table:
+        assert set(row.asdict()) == set(COLUMNS)
+    assert [row.strategy for row, _ in table] == list(STRATEGIES)
+    assert all(type(value) in (str, int, float) for row, _ in table for value in row.asdict().values())
+
+
+def test_every_strategy_shows_what_the_reference_shows(table: list[tuple[Row, Buffers]]) -> None:
+    for row, buffers in table:
+        assert row.iou > 0.99, row.strategy
+        assert row.depth_mean < 1e-4, row.strategy
+        assert row.depth_mean <= row.depth_p99 <= row.depth_max
+        assert row.hits == int(buffers.mask.sum()) > 500
+        assert row.outliers <= 0.01 * row.hits
+
+
+def test_queries_fall_in_the_published_order(table: list[tuple[Row, Buffers]]) -> None:
+    queries = {row.strategy: row.queries for row, _ in table}
+    order = [queries[name] for name in PUBLISHED]
+    assert order == sorted(order, reverse=True)
+    assert len(set(order)) == len(order)
+    entering = int(meet_sphere(poster_view(64).rays()).meets.sum())
+    assert queries["parallel"] == 50 * entering, "every ray at every step"
+    assert order[-1] < order[0] / 5
+
+
+def test_queries_are_all_that_the_field_was_asked_for() -> None:
+    for name, config in STRATEGIES.items():
+        counted = Counted(SOFA)
+        with torch.no_grad():
+            trace = render(counted, poster_view(24), config=config).trace
+        assert trace.total_evaluations == counted.evaluations, name
+        assert (trace.setup_evaluations > 0) == (config.coarse_levels > 0)
+
+
+def test_times_are_medians_of_five_runs_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock advances by what is asked for at each look; two looks to a run."""
+    config = {"dynamic": STRATEGIES["dynamic"]}
+
+    def row_of(*ticks: float) -> Row:
+        times = [sum(ticks[: n + 1]) for n in range(len(ticks))]
+        monkeypatch.setattr("distrace.bench.time.perf_counter", iter(times).__next__)
+        ((row, _),) = ablation(sphere(0.5), poster_view(8), config)
+        return row
+
+    fast = row_of(*(0, 9), *(0, 3), *(0, 1), *(0, 2), *(0, 5), *(0, 4))  # the first run is to warm up
+    assert (fast.seconds, fast.runs) == (3, 5)
+    slow = row_of(0, LONG + 1)
+    assert (slow.seconds, slow.runs) == (LONG + 1, 1)
+
+
+def test_errors_are_measured_against_the_truth_that_is_given() -> None:
+    camera = Camera.orbit(0, 0, 3, height=16, width=16, focal_px=24.0)
+    with torch.no_grad():
+        buffers = render(sphere(0.5), camera)
+    truth = buffers.depth + 0.25
+    truth[0, 0] = 2.0  # a pixel that the rendering misses
+    row = measured("wrong", buffers, truth, 1.0, 1)
+    assert (row.depth_mean, row.depth_max) == (pytest.approx(0.25), pytest.approx(0.25))
+    assert row.outliers == row.hits == int(buffers.mask.sum())
+    assert row.iou == pytest.approx(row.hits / (row.hits + 1))
+
+
+def test_a_view_that_shows_nothing_is_refused() -> None:
+    with pytest.raises(ValueError, match="shows nothing"):
+        next(ablation(lambda points: points.norm(dim=-1) + 1, poster_view(8), STRATEGIES))
+
+
+def test_the_reference_keeps_the_shape_of_the_rays() -> None:
+    rays = poster_view(8).rays()
+    assert reference_distance(sphere(0.5), rays, meet_sphere(rays)).shape == (8, 8)
+    nothing = Bounds(torch.full((8, 8), torch.inf), torch.full((8, 8), -torch.inf))
+    assert (reference_distance(sphere(0.5), rays, nothing) == torch.inf).all()

@@ -1,0 +1,303 @@
+"""The command line: the files and keys that other people's scripts rely on, and one line for whatever goes wrong."""
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from PIL import Image
+from test_train import SPECS, of_sphere, spheres
+
+import distrace.cli
+from distrace.camera import Camera
+from distrace.checkpoint import load_model, save_experiment
+from distrace.data.samples import write_samples
+from distrace.data.view import View, save_view
+from distrace.rays import meet_sphere
+from distrace.train import TrainConfig, start, train
+
+RADII = (0.45, 0.6)
+COMMON = {"seconds", "device", "version"}
+Command = Callable[..., None]
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two spheres, learnt in a second."""
+    folder = tmp_path_factory.mktemp("models") / "spheres"
+    samples, config = spheres(*RADII), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
+    training = start(2, SPECS, config, torch.device("cpu"))
+    for _ in train(samples, training, config):
+        pass
+    save_experiment(folder, training.decoder, training.codes, tuple(samples.names))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def observation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A sphere of radius 0.6, in closed form."""
+    camera = Camera.orbit(30, 20, 2.5, height=32, width=32, focal_px=32.0)
+    bounds = meet_sphere(camera.rays(), 0.6)
+    path = tmp_path_factory.mktemp("observations") / "view.npz"
+    save_view(path, View(camera, camera.depth(bounds.near), bounds.meets))
+    return path
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
+    """The command line, in this process; whatever it sets for the process is set back."""
+
+    def command(*arguments: object) -> None:
+        monkeypatch.setattr(sys, "argv", ["distrace", *map(str, arguments)])
+        distrace.cli.main()
+
+    yield command
+    torch.set_flush_denormal(False)
+
+
+def result(out: Path, *keys: str) -> dict:
+    """`result.json`, after a look at its keys."""
+    content = json.loads((out / "result.json").read_text())
+    assert set(keys) | COMMON <= set(content)
+    assert content["seconds"] > 0
+    return content
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+VIEW = ("--distance", "2.5", "--focal-mm", "32", "--size", "32")
+
+
+def test_render_writes_arrays_and_pictures(model: Path, run: Command, tmp_path: Path) -> None:
+    run("render", model, "--code", 1, "--out", tmp_path, *VIEW)
+    pictures = {"depth.png", "normal.png", "mask.png", "shaded.png"}
+    assert names(tmp_path) == {"result.json", "buffers.npz", *pictures}
+    with np.load(tmp_path / "buffers.npz") as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    assert set(arrays) == {"depth", "distance", "normal", "mask", "evaluations", "outcome"}
+    assert all(array.shape[:2] == (32, 32) for array in arrays.values())
+    assert all(Image.open(tmp_path / name).size == (32, 32) for name in pictures)
+    camera = Camera.orbit(30, 20, 2.5, focal_mm=32, sensor_mm=32, height=32, width=32)
+    closed_form = camera.depth(meet_sphere(camera.rays(), RADII[1]).near).numpy()
+    both = arrays["mask"] & np.isfinite(closed_form)
+    assert both.sum() > 0.8 * np.isfinite(closed_form).sum()
+    assert np.median(np.abs(arrays["depth"][both] - closed_form[both])) < 0.03
+    facts = result(tmp_path, "evaluations", "setup_evaluations", "gradient_evaluations", "clearance_evaluations")
+    assert facts["evaluations"] == arrays["evaluations"].sum() + facts["setup_evaluations"]
+    assert facts["setup_evaluations"] > 0
+    assert facts["clearance_evaluations"] == 0
+    assert facts["gradient_evaluations"] == facts["outcomes"]["hit"] == arrays["mask"].sum()
+
+
+def test_render_counts_what_the_clearance_costs(model: Path, run: Command, tmp_path: Path) -> None:
+    run("render", model, "--clearance", "--strategy", "parallel", "--out", tmp_path, *VIEW)
+    with np.load(tmp_path / "buffers.npz") as archive:
+        clearance, mask = archive["clearance"], archive["mask"]
+    assert np.mean(clearance[~mask] > 0) > 0.99, "a learnt field is no exact distance: a march may just miss"
+    assert np.abs(clearance[mask]).max() < 1e-3
+    facts = result(tmp_path)
+    assert facts["clearance_evaluations"] > 0
+    assert facts["setup_evaluations"] == 0
+    assert facts["strategy"] == "parallel"
+
+
+def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
+    for code, radius in enumerate(RADII):
+        out = tmp_path / str(code)
+        run("mesh", model, "--code", code, "--resolution", 16, "--out", out)
+        assert names(out) == {"result.json", "mesh.ply"}
+        mesh = trimesh.load(out / "mesh.ply", process=False)
+        assert np.linalg.norm(mesh.vertices, axis=1).mean() == pytest.approx(radius, abs=0.04)
+        facts = result(out, "evaluations", "setup_evaluations")
+        assert facts["faces"] == len(mesh.faces)
+        assert facts["evaluations"] > 1000
+
+
+def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
+    trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
+    options = ("--points", 50, "--iterations", 30, "--starts", 2, "--resolution", 16)
+    run("complete", model, observation, "--reference", tmp_path / "true.ply", *options, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+    assert names(out) == {"result.json", "mesh.ply", "code.npy", "report.html", "shaded.png"}
+    facts = result(out, "evaluations", "setup_evaluations", "loss", "chamfer_to", "chamfer_from", "chamfer")
+    assert facts["evaluations"] > 1000
+    assert facts["chamfer"] == pytest.approx(facts["chamfer_to"] + facts["chamfer_from"])
+    assert facts["chamfer"] < 5, "the mean shape is off by 0.075: 2 × 5.6"
+    code = np.load(out / "code.npy")
+    assert code.shape == (4,)
+    fitted = load_model(model).field(torch.from_numpy(code))
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    assert fitted(torch.tensor(mesh.vertices).float()).abs().max() < 0.03, "the mesh is the code's"
+    assert "<html" in (out / "report.html").read_text(encoding="utf-8")[:500]
+
+
+def test_complete_in_a_few_iterations_still_ends_with_a_code(
+    model: Path, observation: Path, run: Command, tmp_path: Path
+) -> None:
+    run("complete", model, observation, "--iterations", 2, "--resolution", 8, "--out", tmp_path)
+    assert np.isfinite(np.load(tmp_path / "code.npy")).all()
+    assert "chamfer" not in result(tmp_path), "nothing was given to measure against"
+
+
+def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
+    run("bench", "trace", model, "--code", 1, "--size", 24, "--out", tmp_path)
+    assert names(tmp_path) == {"result.json", "evaluations.png"}
+    facts = result(tmp_path, "rows", "command", "machine", "evaluations")
+    assert facts["command"].startswith("distrace bench trace")
+    columns = {"model", "strategy", "queries", "setup_queries", "seconds", "hits", "iou", "outliers"}
+    columns |= {"depth_mean", "depth_p99", "depth_max"}
+    assert all(columns <= set(row) for row in facts["rows"])
+    assert {"parallel", "dynamic", "aggressive", "coarse_to_fine"} <= {row["strategy"] for row in facts["rows"]}
+    assert facts["evaluations"] == sum(row["queries"] for row in facts["rows"])
+
+
+def test_without_a_command_or_with_help_it_says_what_there_is(run: Command, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        run("--help")
+    assert stopped.value.code == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in ("demo", "render", "mesh", "complete", "train", "bench", "evaluate"))
+
+
+def one_line(run: Command, capsys: pytest.CaptureFixture, arguments: tuple, status: int = 2) -> str:
+    """Runs what is to fail; its line on stderr."""
+    capsys.readouterr()
+    with pytest.raises(SystemExit) as stopped:
+        run(*arguments)
+    said = capsys.readouterr().err
+    assert stopped.value.code == status
+    assert "Traceback" not in said
+    assert said.count("\n") == 1, said
+    assert said.startswith("distrace: ")
+    assert len(said) > 20
+    assert "---- " not in said
+    return said
+
+
+@pytest.fixture
+def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
+    """What the arguments below name in braces."""
+    (tmp_path / "text").write_text("no observation, no mesh, no split\n")
+    (tmp_path / "empty").write_bytes(b"")
+    (tmp_path / "nothing").mkdir()
+    (tmp_path / "damaged").mkdir()
+    (tmp_path / "damaged" / "specs.json").write_text("{")
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes" / "chair.obj").write_text("no mesh\n")
+    (tmp_path / "samples").mkdir()
+    (tmp_path / "samples" / "chair.npz").write_text("no samples\n")
+    (tmp_path / "stopped").mkdir()
+    (tmp_path / "stopped" / "checkpoint.pt").write_text("no checkpoint\n")
+    write_samples(tmp_path / "good" / "chair.npz", of_sphere(0.5).astype(np.float32))
+    return {"tmp": str(tmp_path), "model": str(model), "view": str(observation), "out": str(tmp_path / "out")}
+
+
+BAD = [
+    ("", "Missing subcommand Expected"),
+    ("paint", "paint"),
+    ("render", "MODEL"),
+    ("render {tmp}/missing", "neither a folder nor a bundled model"),
+    ("render {tmp}/text", "neither a folder nor a bundled model"),
+    ("render {tmp}/nothing", "no specs.json"),
+    ("render {tmp}/damaged", "not a DeepSDF specification"),
+    ("render {model} --colour red", "--colour"),
+    ("render {model} --size many", "--size"),
+    ("render {model} --out {tmp}/text", "is a file; give a folder"),
+    ("render {model} --out {tmp}/text/below", "text"),
+    ("render {model} --code 2", "code 2 was asked for; spheres has 2"),
+    ("render {model} --code -1", "code -1 was asked for"),
+    ("render {model} --size -3", "-3 × -3"),
+    ("render {model} --size 0", "0 × 0"),
+    ("render {model} --size 4000000", "not enough memory"),
+    ("render {model} --steps 0", "steps=0"),
+    ("render {model} --focal-mm 0", "focal length"),
+    ("render {model} --sensor-mm -1", "focal length"),
+    ("render {model} --azimuth nan", "nan"),
+    ("render {model} --distance 0", "its own place"),
+    ("render {model} --strategy slow", "--strategy"),
+    ("render {model} --device tpu", "--device tpu is no device"),
+    ("render {model} --device mps", "--device mps is not supported"),
+    ("mesh {model} --resolution 3", "resolution of 3"),
+    ("mesh {model} --resolution 20", "resolution of 20"),
+    ("mesh {model} --code 9", "code 9"),
+    ("bench trace {model} --size 0", "0 × 0"),
+    ("bench everything {model}", "trace"),
+    ("bench trace {tmp}/missing", "neither a folder nor a bundled model"),
+    ("complete {model} {tmp}/missing.npz", "missing.npz is not an observation"),
+    ("complete {model} {tmp}/text", "text is not an observation"),
+    ("complete {model} {tmp}/empty", "empty is not an observation"),
+    ("complete {model} {tmp}", "is not an observation"),
+    ("complete {model} {view} --points 0", "--points 0"),
+    ("complete {model} {view} --iterations 0", "0 iterations"),
+    ("complete {model} {view} --starts 0", "0 starts"),
+    ("complete {model} {view} --reference {tmp}/text", "no mesh and no cloud"),
+    ("complete {model} {view} --reference {tmp}/missing.ply", "no mesh and no cloud"),
+    ("complete {model} {view} --ignore depth", "--ignore"),
+    ("complete {tmp}/missing {view}", "neither a folder nor a bundled model"),
+    ("complete {model} {view} --iterations 1 --resolution 3", "resolution of 3"),
+    ("evaluate training --model {model} --meshes {tmp}/missing", "no shape in common"),
+    ("evaluate completion --model {model} --meshes {tmp}/missing", "is missing; `distrace data furniture"),
+    ("evaluate completion --model {model} --split {tmp}/text", "lacks the columns"),
+    ("evaluate completion --model {model} --split {tmp}/missing", "there is no split"),
+    ("evaluate fame --model {model}", "fame"),
+    ("data furniture --from {tmp}/text", "text"),
+    ("data furniture --from {tmp}/missing", "missing"),
+    ("data chairs", "chairs"),
+    ("sample {tmp}/missing", "is no folder of meshes"),
+    ("sample {tmp}/nothing", "holds no mesh"),
+    ("sample {tmp}/meshes --count 5", "--count 5"),
+    ("sample {tmp}/meshes --workers 0", "--workers 0"),
+    ("sample {tmp}/meshes --split {tmp}/text", "lacks the columns"),
+    ("train {tmp}/missing", "holds no samples"),
+    ("train {tmp}/samples", "is not a file of samples"),
+    ("train {tmp}/good --split sofas", "holds no samples"),
+    ("train {tmp}/good --out {tmp}/stopped", "is not a checkpoint of a training run"),
+    ("train {tmp}/good --layers 2 --width 4", "each must be at least 1"),
+    ("train {tmp}/good --code-length 0", "each must be at least 1"),
+]
+
+
+@pytest.mark.parametrize(("words", "message"), BAD, ids=[words.replace("/", ".") for words, _ in BAD])
+def test_whatever_is_wrong_is_one_line_and_status_two(
+    words: str, message: str, place: dict[str, str], run: Command, capsys: pytest.CaptureFixture
+) -> None:
+    arguments = tuple(word.format(**place) for word in words.split())
+    out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
+    assert message in one_line(run, capsys, (*arguments, *out))
+    assert not (Path(place["out"]) / "result.json").exists()
+
+
+def test_cuda_is_refused_where_there_is_none(
+    model: Path, run: Command, capsys: pytest.CaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    said = one_line(run, capsys, ("render", model, "--device", "cuda", "--out", tmp_path))
+    assert "has no CUDA; use cpu" in said
+
+
+def test_ctrl_c_ends_in_one_line_and_status_130(
+    model: Path, run: Command, capsys: pytest.CaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(distrace.cli.Mesh, "run", interrupted)
+    said = one_line(run, capsys, ("mesh", model, "--out", tmp_path), status=130)
+    assert "stopped" in said
+
+
+def test_a_bug_is_not_hidden_behind_one_line(
+    model: Path, run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(self: object) -> None:
+        raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
+
+    monkeypatch.setattr(distrace.cli.Mesh, "run", broken)
+    with pytest.raises(RuntimeError, match="mat1"):
+        run("mesh", model, "--out", tmp_path)

@@ -1,0 +1,265 @@
+"""Signed samples, their distribution and files; sampling a folder; and the splits that say what is held out."""
+
+import json
+import math
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from distrace import primitives
+from distrace.data import sampling
+from distrace.data.samples import Doubt, lopsided, sample, write_samples
+from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid
+from distrace.data.split import Shape, every_mesh, read_split
+from distrace.train import load_samples
+
+CUBE = RADIUS / math.sqrt(3) * 2  # the edge of a normalised cube
+COUNT = 5000
+NEAR = 2350  # 47 % of the samples at either distance from the surface
+COLUMNS = "name,split,design,turn,path,creator,licence"
+BUNDLED = sorted(item.name.removesuffix(".csv") for item in (files("distrace") / "splits").iterdir())
+
+
+def plain(mesh: trimesh.Trimesh) -> Solid:
+    """A closed mesh is its own outer surface."""
+    return Solid(mesh, mesh)
+
+
+def cube() -> Solid:
+    return plain(trimesh.creation.box((CUBE, CUBE, CUBE)))
+
+
+def corner() -> trimesh.Trimesh:
+    """An L of two boxes, another shape in the mirror."""
+    arm = trimesh.creation.box((1.0, 0.5, 2.0))
+    arm.apply_translation((1.5, 0, 0.5))
+    return trimesh.util.concatenate([trimesh.creation.box((2.0, 0.5, 1.0)), arm])
+
+
+def corner_distance(points: np.ndarray) -> np.ndarray:
+    """Distance to the normalised L: exact outside."""
+    middle = np.array([0.5, 0, 0.5])  # of x from -1 to 2, z from -0.5 to 1.5
+    scale = RADIUS / math.hypot(1.5, 0.25, 1.0)
+    parts = ((0, 0, 0), (1.0, 0.25, 0.5)), ((1.5, 0, 0.5), (0.5, 0.25, 1.0))
+    at = torch.from_numpy(points.astype(np.float64) / scale + middle)
+    distances = [primitives.box(torch.tensor(half).double())(at - torch.tensor(centre)) for centre, half in parts]
+    return scale * torch.stack(distances).amin(0).numpy()
+
+
+@pytest.fixture(scope="module")
+def of_cube() -> np.ndarray:
+    return sample(cube(), COUNT, seed=1)
+
+
+def test_most_samples_lie_near_the_surface_at_the_two_deviations_of_deepsdf(of_cube: np.ndarray) -> None:
+    assert of_cube.shape == (COUNT, 4)
+    assert of_cube.dtype == np.float32
+    for block, variance in ((of_cube[:NEAR], 0.0025), (of_cube[NEAR : 2 * NEAR], 0.00025)):
+        median = np.median(np.abs(block[:, 3])) / math.sqrt(variance)
+        assert median == pytest.approx(0.6745, abs=0.06), "the median of |N(0, 1)|"
+
+
+def test_the_rest_fill_the_unit_sphere_evenly(of_cube: np.ndarray) -> None:
+    rest = of_cube[2 * NEAR :, :3]
+    assert len(rest) == 300
+    radius = np.linalg.norm(rest, axis=1)
+    assert radius.max() <= 1
+    assert np.mean(radius**3) == pytest.approx(0.5, abs=0.06), "the share of the volume within each is uniform"
+    assert np.linalg.norm(rest.mean(0)) < 0.12
+
+
+def test_distances_of_a_cube_are_exact_and_signed(of_cube: np.ndarray) -> None:
+    expected = primitives.box(torch.full((3,), CUBE / 2))(torch.from_numpy(of_cube[:, :3])).numpy()
+    np.testing.assert_allclose(of_cube[:, 3], expected, atol=2e-6)
+
+
+def test_distances_of_a_sphere_are_right_to_its_facets() -> None:
+    samples = sample(plain(trimesh.creation.icosphere(subdivisions=3, radius=0.7)), 2000, seed=2)
+    np.testing.assert_allclose(samples[:, 3], np.linalg.norm(samples[:, :3], axis=1) - 0.7, atol=4e-3)
+
+
+def test_a_seed_gives_the_same_samples_and_another_gives_others(of_cube: np.ndarray) -> None:
+    np.testing.assert_array_equal(sample(cube(), COUNT, seed=1), of_cube)
+    assert (sample(cube(), COUNT, seed=2) != of_cube).all(1).mean() > 0.99
+
+
+def test_a_file_of_samples_holds_the_outside_and_the_inside_apart(of_cube: np.ndarray, tmp_path: Path) -> None:
+    write_samples(tmp_path / "cube.npz", of_cube)
+    with np.load(tmp_path / "cube.npz") as archive:
+        pos, neg = archive["pos"], archive["neg"]
+    assert pos.dtype == neg.dtype == np.float32
+    assert pos.shape[1] == neg.shape[1] == 4
+    assert len(pos) + len(neg) == COUNT
+    assert min(len(pos), len(neg)) > COUNT / 4
+    assert pos[:, 3].min() >= 0 > neg[:, 3].max()
+    loaded = load_samples([tmp_path / "cube.npz"])
+    np.testing.assert_array_equal(loaded.inside[0].numpy(), neg)
+    np.testing.assert_array_equal(loaded.outside[0].numpy(), pos)
+
+
+def test_a_shape_and_its_mirror_image_are_told_apart() -> None:
+    assert not lopsided(cube())
+    mesh = corner()
+    mesh.apply_translation((-0.5, 0, -0.5))
+    assert lopsided(plain(mesh.apply_scale(0.4)))
+
+
+# ---- sampling a folder: one run, with one worker, for all that follows
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Meshes: an L, once to train on and once held out, a cube, a tube open at both ends, and a file of words."""
+    folder = tmp_path_factory.mktemp("sampling")
+    (folder / "meshes").mkdir()
+    corner().export(folder / "meshes" / "corner.ply")
+    trimesh.creation.box().export(folder / "meshes" / "cube.ply")
+    tube = trimesh.creation.box()
+    tube.update_faces(np.abs(tube.face_normals[:, 1]) < 0.5)
+    tube.export(folder / "meshes" / "tube.ply")
+    (folder / "meshes" / "words.obj").write_text("no mesh at all\n")
+    rows = ["left,train,corner,90,corner.ply", "cube,train,cube,0,cube.ply", "held,test,held,0,corner.ply"]
+    rows += ["tube,train,tube,0,tube.ply", "words,train,words,0,words.obj"]
+    (folder / "split.csv").write_text("\n".join([COLUMNS, *(f"{row},me,CC0-1.0" for row in rows)]))
+    return folder
+
+
+def jobs(folder: Path) -> list[sampling.Job]:
+    shapes = read_split(folder / "split.csv")
+    return sampling.jobs(shapes, folder / "meshes", folder / "out", 1500, mirror=True, stretches=1)
+
+
+@pytest.fixture(scope="module")
+def reports(folder: Path) -> dict[str, Doubt]:
+    return {report.name: report for report in sampling.run(jobs(folder), workers=1)}
+
+
+def read(path: Path) -> np.ndarray:
+    with np.load(path) as archive:
+        return np.concatenate([archive["pos"], archive["neg"]]).astype(np.float64)
+
+
+def test_only_shapes_to_train_on_have_variants_and_only_lopsided_ones_a_mirrored_one(
+    folder: Path, reports: dict[str, Doubt]
+) -> None:
+    assert {path.stem for path in (folder / "out").glob("*.npz")} == {
+        *("left", "left~mirrored", "left~stretched1"),
+        *("cube", "cube~stretched1"),
+        "held",
+    }
+    assert all(len(read(path)) == 1500 for path in (folder / "out").glob("*.npz"))
+
+
+def test_a_hopeless_mesh_is_named_and_left_out(folder: Path, reports: dict[str, Doubt]) -> None:
+    assert {name for name, report in reports.items() if not report.usable} == {"tube", "words"}
+    assert "signs are doubtful" in reports["tube"].reason
+    assert "words.obj cannot be read as a triangle mesh" in reports["words"].reason
+    assert reports["cube"].reason == ""
+    assert reports["cube"].outer_area == pytest.approx(1)
+    stored = json.loads((folder / "out" / "tube.json").read_text())
+    assert Doubt(**stored) == reports["tube"]
+
+
+def test_samples_are_of_the_shape_turned_to_the_orientation_of_its_class(
+    folder: Path, reports: dict[str, Doubt]
+) -> None:
+    samples = read(folder / "out" / "left.npz")
+    x, y, z = samples[:, :3].T
+    expected = corner_distance(np.stack([-z, y, x], axis=1))  # a quarter turn about y brings (x, y, z) to (z, y, -x)
+    outside = samples[:, 3] > 0
+    np.testing.assert_allclose(samples[outside, 3], expected[outside], atol=SMALLEST)
+    assert (expected[~outside] < 1e-3).all()
+
+
+def test_the_mirrored_variant_is_of_the_mirror_image(folder: Path, reports: dict[str, Doubt]) -> None:
+    held = load_solid(folder / "meshes" / "corner.ply")
+    mirrored = read(folder / "out" / "left~mirrored.npz")
+    x, y, z = mirrored[:, :3].T
+    turned_back = np.stack([-z, y, -x], axis=1)  # the mirror in x, then the quarter turn back
+    clear = np.abs(mirrored[:, 3]) > 1e-3
+    np.testing.assert_allclose(mirrored[clear, 3], held.distance(turned_back)[clear], atol=1e-5)
+    there = np.abs(held.distance(np.stack([-z, y, x], axis=1)) - mirrored[:, 3])
+    assert there.max() > 0.1, "the L itself is another shape"
+
+
+def test_a_second_run_rewrites_nothing_and_reports_the_same(folder: Path, reports: dict[str, Doubt]) -> None:
+    before = {path: path.stat().st_mtime_ns for path in (folder / "out").iterdir()}
+    assert {report.name: report for report in sampling.run(jobs(folder), workers=1)} == reports
+    assert {path: path.stat().st_mtime_ns for path in (folder / "out").iterdir()} == before
+
+
+def test_a_run_that_was_stopped_goes_on_with_what_is_missing(folder: Path, reports: dict[str, Doubt]) -> None:
+    """The report is written last: a shape without one is done again, and comes out the same."""
+    cube_file, report = folder / "out" / "cube.npz", folder / "out" / "cube.json"
+    samples = read(cube_file)
+    report.unlink()
+    cube_file.unlink()
+    (job,) = (job for job in jobs(folder) if sampling._earlier(job) is None)
+    assert sampling.run_one(job) == reports["cube"]
+    np.testing.assert_array_equal(read(cube_file), samples)
+
+
+# ---- splits
+
+
+@pytest.mark.parametrize("name", BUNDLED)
+def test_in_a_bundled_split_each_design_is_on_one_side_and_each_shape_is_free(name: str) -> None:
+    shapes = read_split(name)
+    assert len({shape.name for shape in shapes}) == len(shapes)
+    assert len({shape.path for shape in shapes}) == len(shapes)
+    assert {shape.split for shape in shapes} == {"train", "test"}
+    sides = {
+        design: {shape.split for shape in shapes if shape.design == design} for design in {s.design for s in shapes}
+    }
+    assert [design for design, splits in sides.items() if len(splits) > 1] == []
+    assert all(shape.licence.startswith("CC") and shape.creator for shape in shapes)
+    assert not any("NC" in shape.licence or "ND" in shape.licence for shape in shapes)
+
+
+def test_the_sofas_are_seventeen_to_train_on_and_at_least_five_held_out() -> None:
+    splits = [shape.split for shape in read_split("sofas")]
+    assert splits.count("train") == 17
+    assert splits.count("test") >= 5
+
+
+def test_a_split_may_have_more_columns(tmp_path: Path) -> None:
+    path = tmp_path / "mine.csv"
+    path.write_text(f"{COLUMNS},note\nchair,train,chair,-90,a/chair.obj,me,CC0-1.0,mine\n")
+    assert read_split(path) == [Shape("chair", "train", "chair", -90.0, "a/chair.obj", "me", "CC0-1.0")]
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, "there is no split"),
+        (b"name,split\na,train\n", "lacks the columns design, turn, path, creator, licence"),
+        (f"{COLUMNS}\nchair,train\n".encode(), "cannot be read"),
+        (f"{COLUMNS}\nchair,train,chair,left,a.obj,me,CC0-1.0\n".encode(), "cannot be read"),
+        (b"\xff\xfe\x00\x01", "cannot be read"),
+    ],
+    ids=["missing", "columns", "short", "turn", "binary"],
+)
+def test_a_split_that_cannot_be_read_ends_in_one_sentence(tmp_path: Path, content: bytes | None, message: str) -> None:
+    path = tmp_path / "mine.csv"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match=message) as caught:
+        read_split(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_every_mesh_below_a_folder_is_named_by_its_path(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="holds no mesh"):
+        every_mesh(tmp_path)
+    for name in ("b/chair.OBJ", "a/chair.ply", "a/readme.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("")
+    shapes = every_mesh(tmp_path)
+    assert [shape.name for shape in shapes] == ["a-chair", "b-chair"]
+    assert [shape.path for shape in shapes] == ["a/chair.ply", "b/chair.OBJ"]
+    assert {shape.split for shape in shapes} == {"train"}

@@ -1,0 +1,269 @@
+"""Learning shapes: that it works, that a run goes on as if it had not been stopped, and what its files hold."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+import distrace.cli.train
+from distrace.checkpoint import load_model, save_experiment
+from distrace.cli import main
+from distrace.data.samples import write_samples
+from distrace.decoder import NetworkSpecs
+from distrace.resume import NAME, load_training, save_training
+from distrace.train import Samples, TrainConfig, Training, bound_codes, draw, load_samples, start, train
+
+CPU = torch.device("cpu")
+SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
+CONFIG = TrainConfig(steps=12, samples_per_step=64)
+TINY = ("--steps", "120", "--samples-per-step", "32", "--layers", "3", "--width", "16", "--code-length", "4")
+
+
+def of_sphere(radius: float, count: int = 3000, seed: int = 0) -> np.ndarray:
+    """Signed samples: half of them near the surface."""
+    random = np.random.default_rng(seed)
+    direction = random.normal(size=(count, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    distance = np.where(np.arange(count) % 2, random.normal(0, 0.05, count), random.uniform(-radius, 1 - radius, count))
+    return np.column_stack([direction * np.maximum(radius + distance, 0)[:, None], np.maximum(distance, -radius)])
+
+
+def spheres(*radii: float) -> Samples:
+    parts = [torch.from_numpy(of_sphere(radius)).float() for radius in radii]
+    names = [f"sphere{number}" for number in range(len(radii))]
+    return Samples(names, [part[part[:, 3] >= 0] for part in parts], [part[part[:, 3] < 0] for part in parts])
+
+
+def sample_files(folder: Path, *radii: float) -> Path:
+    for number, radius in enumerate(radii):
+        write_samples(folder / f"sphere{number}.npz", of_sphere(radius).astype(np.float32))
+    return folder
+
+
+def finished(samples: Samples, config: TrainConfig) -> Training:
+    training = start(len(samples.names), SPECS, config, CPU)
+    for _ in train(samples, training, config):
+        pass
+    return training
+
+
+def assert_same(one: Training, other: Training) -> None:
+    assert one.step == other.step
+    assert torch.equal(one.codes, other.codes)
+    for name, value in one.decoder.state_dict().items():
+        assert torch.equal(value, other.decoder.state_dict()[name]), name
+
+
+def one_sentence(caught: pytest.ExceptionInfo, path: Path) -> None:
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator:
+    """The command line, in this process; whatever it sets for the process is set back."""
+
+    def command(*arguments: str | Path) -> None:
+        monkeypatch.setattr(sys, "argv", ["distrace", *map(str, arguments)])
+        main()
+
+    yield command
+    torch.set_flush_denormal(False)
+
+
+def test_a_tiny_network_learns_a_sphere() -> None:
+    samples, config = spheres(0.5), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
+    training = start(1, SPECS, config, CPU)
+    losses = [step.loss for step in train(samples, training, config)]
+    assert sum(losses[-20:]) / 20 < sum(losses[:5]) / 5 / 5, "a fifth of the loss at the start"
+    field = training.decoder.eval().field(training.codes[0].detach())
+    along = torch.linspace(0.1, 0.9, 81)[:, None] * torch.tensor([0.6, 0.0, -0.8])
+    with torch.no_grad():
+        values = field(along)
+    assert (values[:31] < 0).all(), "within 0.4"
+    assert (values[50:] > 0).all(), "beyond 0.6"
+
+
+def test_two_spheres_get_codes_of_their_own() -> None:
+    samples, config = spheres(0.3, 0.6), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
+    training = finished(samples, config)
+    at = torch.tensor([[0.0, 0.45, 0.0]])
+    with torch.no_grad():
+        small, large = (training.decoder.field(code)(at) for code in training.codes)
+    assert small > 0.02
+    assert large < -0.02
+
+
+def test_a_draw_takes_as_many_samples_inside_as_outside_of_every_shape() -> None:
+    torch.manual_seed(0)
+    shapes, batch = draw(spheres(0.3, 0.6, 0.5), replace(CONFIG, shapes_per_step=2))
+    assert len(set(shapes.tolist())) == 2
+    assert batch.shape == (2, 32, 4)
+    assert ((batch[..., 3] < 0).sum(1) == 16).all()
+    for shape, points in zip(shapes, batch):
+        radius = (0.3, 0.6, 0.5)[shape]
+        torch.testing.assert_close(points[:, :3].norm(dim=-1) - radius, points[:, 3], atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("stop", [1, 7])
+def test_a_run_that_was_stopped_ends_bit_for_bit_like_one_that_was_not(tmp_path: Path, stop: int) -> None:
+    samples = spheres(0.3, 0.6)
+    first = start(2, SPECS, CONFIG, CPU)
+    for _ in islice(train(samples, first, CONFIG), stop):
+        pass
+    save_training(tmp_path, first, CONFIG, samples.names)
+    torch.manual_seed(99)  # what happened meanwhile is of no account
+    loaded = load_training(tmp_path, samples.names, CPU)
+    assert loaded is not None
+    resumed, config = loaded
+    assert config == CONFIG
+    assert resumed.step == stop
+    steps = [step.step for step in train(samples, resumed, config)]
+    assert steps == list(range(stop + 1, CONFIG.steps + 1))
+    assert_same(resumed, finished(samples, CONFIG))
+
+
+def test_another_seed_gives_another_network() -> None:
+    one, other = (finished(spheres(0.5), replace(CONFIG, steps=1, seed=seed)) for seed in (0, 1))
+    assert not torch.equal(one.codes, other.codes)
+    assert not torch.equal(one.decoder.lin1.weight, other.decoder.lin1.weight)
+
+
+def test_codes_stay_within_their_bound() -> None:
+    config = replace(CONFIG, code_bound=0.05, code_learning_rate=0.1)
+    norms = finished(spheres(0.3, 0.6), config).codes.norm(dim=-1)
+    assert norms.max() <= 0.05 * (1 + 1e-6)
+    assert finished(spheres(0.3, 0.6), replace(config, code_bound=9.0)).codes.norm(dim=-1).min() > 0.06
+
+
+def test_only_codes_beyond_the_bound_are_scaled() -> None:
+    codes = torch.tensor([[3.0, 4.0], [0.3, 0.4], [0.0, 0.0]])
+    bound_codes(codes, 1.0)
+    torch.testing.assert_close(codes, torch.tensor([[0.6, 0.8], [0.3, 0.4], [0.0, 0.0]]))
+
+
+def test_a_trained_folder_opens_as_a_model(tmp_path: Path) -> None:
+    samples = spheres(0.3, 0.6)
+    training = finished(samples, CONFIG)
+    save_experiment(tmp_path, training.decoder, training.codes, tuple(samples.names))
+    model = load_model(tmp_path)
+    assert model.shapes == ("sphere0", "sphere1")
+    points = samples.outside[0][:50, :3]
+    with torch.no_grad():
+        for number, code in enumerate(training.codes):
+            torch.testing.assert_close(model.field(number)(points), training.decoder.field(code)(points))
+
+
+def test_there_is_no_run_to_go_on_with_in_an_empty_folder(tmp_path: Path) -> None:
+    assert load_training(tmp_path, ["a"], CPU) is None
+
+
+@pytest.mark.parametrize("damage", ["cut", "words", "empty", "other", "other-network"])
+def test_a_damaged_checkpoint_ends_in_one_sentence(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / NAME
+    save_training(tmp_path, start(1, SPECS, CONFIG, CPU), CONFIG, ["a"])
+    whole = path.read_bytes()
+    if damage.startswith("other"):
+        state = torch.load(path, weights_only=True)
+        state = {"some": torch.zeros(3)} if damage == "other" else state | {"specs": {"dims": (8, 8)}}
+        torch.save(state, path)
+    else:
+        path.write_bytes({"cut": whole[: len(whole) // 2], "words": b"no checkpoint", "empty": b""}[damage])
+    with pytest.raises(ValueError, match="is not a checkpoint of a training run; move it away") as caught:
+        load_training(tmp_path, ["a"], CPU)
+    one_sentence(caught, path)
+
+
+def test_a_checkpoint_of_other_samples_ends_in_one_sentence(tmp_path: Path) -> None:
+    save_training(tmp_path, start(2, SPECS, CONFIG, CPU), CONFIG, ["a", "b"])
+    for names in (["a"], ["a", "c"], ["a", "b", "c"]):
+        with pytest.raises(ValueError, match="was trained on 2 files of samples, and now there are") as caught:
+            load_training(tmp_path, names, CPU)
+        one_sentence(caught, tmp_path / NAME)
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"pos": np.ones((5, 4))}, "is not a file of samples"),
+        ({"pos": np.ones((5, 4)), "neg": np.ones((5, 3))}, r"neg has shape \[5, 3\]"),
+        ({"pos": np.ones((0, 4)), "neg": np.ones((5, 4))}, r"pos has shape \[0, 4\]"),
+        ({"pos": np.full((5, 4), np.nan), "neg": np.ones((5, 4))}, "finite values"),
+        ({"pos": np.array([[None]], dtype=object), "neg": np.ones((5, 4))}, "is not a file of samples"),
+        (None, "is not a file of samples"),
+    ],
+)
+def test_what_is_no_file_of_samples_ends_in_one_sentence(tmp_path: Path, arrays: dict | None, message: str) -> None:
+    path = tmp_path / "shape.npz"
+    path.write_bytes(b"words")
+    if arrays is not None:
+        np.savez(path, **arrays)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_samples([path])
+    one_sentence(caught, path)
+
+
+def checkpoint(folder: Path) -> dict:
+    return torch.load(folder / NAME, weights_only=True)
+
+
+def kill_once_saved(process: subprocess.Popen, folder: Path) -> None:
+    """SIGKILL, as soon as there is something to go on from."""
+    patience = time.monotonic() + 300
+    while not (folder / NAME).exists():
+        assert process.poll() is None, "the run ended before it was killed"
+        assert time.monotonic() < patience
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+
+
+def assert_same_state(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
+    assert one.keys() == other.keys()
+    assert [name for name in one if not torch.equal(one[name], other[name])] == []
+
+
+def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Path, run, monkeypatch) -> None:
+    samples, killed, whole = sample_files(tmp_path / "samples", 0.3, 0.6), tmp_path / "killed", tmp_path / "whole"
+    program = "import torch; torch.set_num_threads(1); from distrace.cli import main; main()"
+    arguments = [sys.executable, "-c", program, "train", samples, "--out", killed, *TINY, "--save-every", "0"]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    process = subprocess.Popen(arguments, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    kill_once_saved(process, killed)
+    state = checkpoint(killed)
+    assert 0 < state["step"] < 120
+    assert not (killed / "result.json").exists()
+
+    run("train", samples, "--out", killed)  # its own configuration, not the default one, is gone on with
+    chosen = state["config"]["bfloat16"]
+    monkeypatch.setattr(distrace.cli.train, "faster_in_bfloat16", lambda specs, device: chosen)  # it is a stopwatch
+    run("train", samples, "--out", whole, *TINY)
+
+    one, other = checkpoint(killed), checkpoint(whole)
+    assert one["step"] == other["step"] == 120
+    assert one["config"] == other["config"]
+    assert torch.equal(one["codes"], other["codes"])
+    assert_same_state(one["decoder"], other["decoder"])
+    wanted = {"result.json", "specs.json", NAME, "preview.png", "ModelParameters", "LatentCodes"}
+    assert {path.name for path in whole.iterdir()} == wanted
+    assert load_model(whole).shapes == ("sphere0", "sphere1")
+
+
+def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytest.CaptureFixture) -> None:
+    samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
+    run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
+    before = checkpoint(out)
+    capsys.readouterr()
+    run("train", samples, "--out", out, "--steps", "3")
+    assert "going on from step 3 of 3" in capsys.readouterr().out
+    assert_same_state(before["decoder"], checkpoint(out)["decoder"])
