@@ -1,4 +1,4 @@
-"""What a camera would see of a mesh, as an observation for `distrace complete`, and its true surface to measure against.
+"""What a camera sees of a mesh, as an observation for `distrace complete`, and the true surface to measure against.
 
     python examples/03_observe_a_mesh.py SPLIT SHAPE MESHES OUT
 
@@ -17,12 +17,12 @@ from distrace.bench import poster_view
 from distrace.data.split import read_split
 from distrace.data.view import observe, save_view
 from distrace.evaluate import OBSERVATION_SIZE, solid_of
-from distrace.metrics import surface_points
+from distrace.metrics import POINTS, surface_points
 
 split, name, meshes, out = sys.argv[1:5]
 (shape,) = (shape for shape in read_split(split) if shape.name == name)
 solid = solid_of(shape, Path(meshes))
 view = observe(solid, poster_view(OBSERVATION_SIZE))
 save_view(Path(out) / f"{name}.npz", replace(view, normal=view.normal.half()))
-points = surface_points(solid.surface, seed=1).astype(np.float32)
+points = surface_points(solid.surface, POINTS, seed=1).astype(np.float32)
 trimesh.PointCloud(points).export(Path(out) / f"{name}.ply")

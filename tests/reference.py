@@ -48,10 +48,13 @@ def march(
             return Ended("HIT", min(max(polished(t, value, before), near), far), evaluations)
         if value < 0 and t <= near:
             return Ended("INSIDE", math.inf, evaluations)
+        proposed = t + step_scale * max(-step_limit, min(value, step_limit))
+        if before is not None and value * before[1] < 0 and abs(value) > 0.7 * abs(before[1]):
+            proposed = t - value * (t - before[0]) / (value - before[1])
         before = t, value
         inside = min(inside, t) if value < 0 else inside
         outside = t if value > 0 and t < inside else outside
-        t = max(t + step_scale * max(-step_limit, min(value, step_limit)), near)
+        t = max(proposed, near)
         if math.isfinite(outside) and math.isfinite(inside) and not outside < t < inside:
             t = (outside + inside) / 2
         if t > far:

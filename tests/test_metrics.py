@@ -57,7 +57,7 @@ def test_the_measure_of_the_same_meshes_is_the_same_again() -> None:
 
 
 def test_points_are_spread_evenly_over_the_area() -> None:
-    points = surface_points(trimesh.creation.box([1, 1, 3]), seed=0)
+    points = surface_points(trimesh.creation.box([1, 1, 3]), POINTS, seed=0)
     assert points.shape == (POINTS, 3)
     on_ends = np.isclose(np.abs(points[:, 2]), 1.5).mean()
     assert on_ends == pytest.approx(2 / 14, rel=0.05)

@@ -4,7 +4,10 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
+
+import numpy as np
+from torch import Tensor
 
 
 @contextmanager
@@ -20,3 +23,10 @@ def written(path: Path) -> Iterator[BinaryIO]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+def save_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
+    """An `.npz` of tensors."""
+    content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
+    with written(path) as file:
+        np.savez_compressed(file, **content)

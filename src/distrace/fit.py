@@ -26,14 +26,14 @@ LEAST_DEVIATION = 0.4  # of the mean one: on held-out sofas better than none and
 class FitConfig:
     """Adam on the code, its rate falling to zero along a cosine."""
 
-    iterations: int = 200
+    iterations: int = 150
     learning_rate: float = 0.1  # in standard deviations of the training codes
     depth_rays: int = 1000  # of each view at each iteration
     mask_rays: int = 500
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
-    starts: int = 4
-    trial: int = 25  # iterations that every start is given before the best goes on alone
+    starts: int = 3
+    trial: int = 20  # iterations that every start is given before the best goes on alone
     trace: TraceConfig = field(default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=5e-4))
     seed: int = 0
 
@@ -70,7 +70,7 @@ class Step:
 def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
     """The Gaussian of some training codes; of fewer than two, DeepSDF's N(0, 0.1²).
 
-    Directions in which the training codes hardly differ keep a small deviation: shapes that were not trained on need them.
+    Directions in which the training codes hardly differ keep a small deviation: shapes not trained on need them.
     """
     length = codes.shape[1]
     if len(codes) < 2:
@@ -83,7 +83,7 @@ def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
 
 
 def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig = FitConfig()) -> Iterator[Step]:
-    """Fits a code to views. Several starts are tried, the one of the least loss goes on; the last step is the result.
+    """Fits a code to views. Of several starts the one of the least loss goes on; its last step is the result.
 
     Raises `ValueError` without views.
     """

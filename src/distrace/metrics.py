@@ -6,7 +6,7 @@ import numpy as np
 import torch
 import trimesh
 from jaxtyping import Bool, Float
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 from torch import Tensor
 
 POINTS = 30_000
@@ -29,23 +29,27 @@ def chamfer(predicted: trimesh.Trimesh | np.ndarray, truth: trimesh.Trimesh | np
 
     Raises `ValueError` for an empty surface.
     """
-    first, second = surface_points(predicted, seed), surface_points(truth, seed + 1)
-    to, _ = cKDTree(second).query(first, workers=-1)
-    from_, _ = cKDTree(first).query(second, workers=-1)
+    first, second = _cloud(predicted, seed), _cloud(truth, seed + 1)
+    to, _ = KDTree(second).query(first, workers=-1)
+    from_, _ = KDTree(first).query(second, workers=-1)
     return Chamfer(float(1000 * np.mean(to**2)), float(1000 * np.mean(from_**2)))
 
 
-def surface_points(surface: trimesh.Trimesh | np.ndarray, seed: int) -> Float[np.ndarray, "n 3"]:
-    """Points spread evenly over a mesh; a cloud is taken as it is."""
+def surface_points(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
+    """Points spread evenly over a mesh."""
+    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+
+
+def _cloud(surface: trimesh.Trimesh | np.ndarray, seed: int) -> Float[np.ndarray, "n 3"]:
+    """Points of a mesh; a cloud is taken as it is."""
     if isinstance(surface, trimesh.Trimesh):
         if not len(surface.faces):
             raise ValueError("a mesh without faces was given; chamfer needs a surface on both sides")
-        return np.asarray(trimesh.sample.sample_surface(surface, POINTS, seed=seed)[0])
+        return surface_points(surface, POINTS, seed)
     points = np.asarray(surface)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ValueError(
-            f"points of shape {list(points.shape)} were given; chamfer takes meshes or clouds of shape [n, 3]"
-        )
+        given = list(points.shape)
+        raise ValueError(f"points of shape {given} were given; chamfer takes meshes or clouds of shape [n, 3]")
     return points
 
 

@@ -65,8 +65,14 @@ class Trace:
         return self.setup_evaluations + int(self.evaluations.sum())
 
     def reshaped(self, shape: torch.Size) -> "Trace":
-        fields = (self.distance, self.outcome, self.closest, self.stopped, self.evaluations)
-        return Trace(*(values.reshape(shape) for values in fields), self.setup_evaluations)
+        return Trace(
+            self.distance.reshape(shape),
+            self.outcome.reshape(shape),
+            self.closest.reshape(shape),
+            self.stopped.reshape(shape),
+            self.evaluations.reshape(shape),
+            self.setup_evaluations,
+        )
 
 
 @torch.no_grad()
@@ -167,11 +173,14 @@ class _March:
         self.last_t[at], self.last_value[at] = t, value
 
     def _bracketed(self, at: Tensor, value: Tensor, proposed: Tensor) -> Tensor:
-        """The proposed distance, or the middle of a sign change that it would jump out of.
+        """The proposed distance; but between two samples of different sign that hardly come closer, the secant to zero,
+        and the middle of a sign change that would be jumped out of.
 
-        Where step_scale · |f'| > 2 the march would bounce about the zero for ever.
+        Where step_scale · |f'| along the ray is near 2 or above, the march would bounce about the zero.
         """
-        t = self.t[at]
+        t, last = self.t[at], self.last_value[at]
+        bounces = (value * last < 0) & (value.abs() > 0.7 * last.abs())
+        proposed = torch.where(bounces, t + self._to_secant(at, value), proposed)
         inside = torch.where(value < 0, t.minimum(self.inside[at]), self.inside[at])
         outside = torch.where((value > 0) & (t < inside), t, self.outside[at])
         self.inside[at], self.outside[at] = inside, outside
@@ -179,13 +188,17 @@ class _March:
         return torch.where(jumps, (outside + inside) / 2, proposed)
 
     def _to_zero(self, at: Tensor, value: Tensor) -> Tensor:
-        """From a converged sample to the zero of the line through it and the one before; else by the value itself.
+        """From a converged sample to the zero of the secant; else by the value itself.
 
         The latter on a first sample (where the secant is NaN, which compares false) and along the surface: a step by
         the distance never leads too far.
         """
-        move = -value * (self.t[at] - self.last_t[at]) / (value - self.last_value[at])
+        move = self._to_secant(at, value)
         return torch.where(move.abs() <= 20 * value.abs(), move, value)
+
+    def _to_secant(self, at: Tensor, value: Tensor) -> Tensor:
+        """From a sample to the zero of the line through it and the one before."""
+        return -value * (self.t[at] - self.last_t[at]) / (value - self.last_value[at])
 
     def result(self) -> Trace:
         outcome = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED))

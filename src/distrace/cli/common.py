@@ -3,7 +3,6 @@
 from pathlib import Path
 from typing import Annotated
 
-import numpy as np
 import torch
 import trimesh
 import tyro
@@ -11,7 +10,7 @@ import tyro
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
-from distrace.files import written
+from distrace.files import save_arrays, written
 from distrace.render import Buffers
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
@@ -43,10 +42,9 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
     arrays |= {"evaluations": buffers.trace.evaluations, "outcome": buffers.trace.outcome}
     if clearance:
         arrays["clearance"] = buffers.clearance
-    with written(path) as file:
-        np.savez_compressed(file, **{name: array.cpu().numpy() for name, array in arrays.items()})
+    save_arrays(path, arrays)
 
 
 def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
     with written(path) as file:
-        file.write(mesh.export(file_type="ply"))
+        mesh.export(file, file_type="ply")

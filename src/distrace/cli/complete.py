@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -95,7 +95,7 @@ def _known(full: View, points: int | None, ignore: tuple[str, ...], seed: int) -
 
 def _reference(path: Path) -> trimesh.Trimesh | np.ndarray:
     with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface"):
-        loaded = trimesh.load(path, process=False)
+        loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         return loaded if len(getattr(loaded, "faces", ())) else np.asarray(loaded.vertices, dtype=np.float64)

@@ -11,13 +11,22 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from distrace.errors import explained
 from distrace.files import written
 
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
+QUIET = 20.0  # seconds between lines where the output is no terminal
 
 
 @dataclass
@@ -84,24 +93,26 @@ def progress(description: str, total: int) -> Iterator["Bar"]:
 
 @dataclass
 class Bar:
+    """A line of progress; where the output is no terminal, a line now and then."""
+
     bars: Progress
-    task: Any
+    task: TaskID
+    said: float = field(default_factory=time.monotonic)
 
     def advance(self, words: str = "", to: int | None = None) -> None:
         if to is None:
             self.bars.update(self.task, advance=1, words=words)
         else:
             self.bars.update(self.task, completed=to, words=words)
+        if not console.is_terminal and time.monotonic() - self.said > QUIET:
+            task = self.bars.tasks[self.task]
+            console.print(f"{task.description} {task.completed:.0f}/{task.total:.0f} {words}", markup=False)
+            self.said = time.monotonic()
 
 
 def machine() -> str:
     """Processor and library versions, for recorded tables."""
     cpu = Path("/proc/cpuinfo")
-    names = (
-        [line.split(":", 1)[1].strip() for line in cpu.read_text().splitlines() if line.startswith("model name")]
-        if cpu.exists()
-        else []
-    )
-    return (
-        f"{names[0] if names else 'unknown processor'}, {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-    )
+    lines = cpu.read_text().splitlines() if cpu.exists() else []
+    name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
+    return f"{name}, {torch.get_num_threads()} threads, PyTorch {torch.__version__}"

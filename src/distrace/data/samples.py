@@ -5,11 +5,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from distrace.data.solid import Solid
 from distrace.files import written
+from distrace.metrics import surface_points
 
 NEAR = 0.94  # the share of samples near the surface; the rest fills the unit sphere
 VARIANCES = (0.0025, 0.00025)
@@ -33,7 +33,7 @@ def sample(solid: Solid, count: int, seed: int) -> Float[np.ndarray, "count 4"]:
     """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""
     random = np.random.default_rng(seed)
     near = int(NEAR * count) // 2
-    surface, _ = trimesh.sample.sample_surface(solid.surface, near, seed=seed)
+    surface = surface_points(solid.surface, near, seed)
     displaced = [surface + random.normal(size=surface.shape) * variance**0.5 for variance in VARIANCES]
     direction = random.normal(size=(count - 2 * near, 3))
     radius = random.random((len(direction), 1)) ** (1 / 3)
@@ -54,7 +54,7 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
 
 def lopsided(solid: Solid, count: int = 2000) -> bool:
     """Whether the mirror image in x is another shape."""
-    points, _ = trimesh.sample.sample_surface(solid.surface, count, seed=0)
+    points = surface_points(solid.surface, count, seed=0)
     return bool(np.mean(solid.distance(points * (-1, 1, 1)) ** 2) > 2e-5)
 
 

@@ -34,8 +34,12 @@ class Job:
 
 def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, stretches: int) -> list[Job]:
     """The shapes to sample; only those to train on have variants."""
-    variants = {"train": (mirror, stretches)}
-    return [Job(shape, meshes / shape.path, out, count, *variants.get(shape.split, (False, 0))) for shape in shapes]
+
+    def job(shape: Shape) -> Job:
+        learnt = shape.split == "train"
+        return Job(shape, meshes / shape.path, out, count, mirror and learnt, stretches if learnt else 0)
+
+    return [job(shape) for shape in shapes]
 
 
 def run(todo: list[Job], workers: int) -> Iterator[Doubt]:
@@ -72,10 +76,10 @@ def _write(job: Job, solid: Solid) -> None:
     samples = sample(solid, job.count, seed)
     write_samples(job.samples(), samples)
     if job.mirror and lopsided(solid):
-        write_samples(job.samples("~mirrored"), samples * np.float32([-1, 1, 1, 1]))
+        write_samples(job.samples("~mirrored"), samples * np.array([-1, 1, 1, 1], np.float32))
     random = np.random.default_rng(seed)
     for number in range(1, job.stretches + 1):
-        factors = np.exp(random.uniform(-STRETCH, STRETCH, 3)) * (random.choice([-1, 1]), 1, 1)
+        factors = np.exp(random.uniform(-STRETCH, STRETCH, 3)) * (1 - 2 * random.integers(2), 1, 1)
         write_samples(job.samples(f"~stretched{number}"), sample(stretched(solid, factors), job.count, seed + number))
 
 

@@ -7,6 +7,7 @@ Barill et al., SIGGRAPH 2018); its surface is the part of the soup across which 
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import igl
 import numpy as np
@@ -47,7 +48,7 @@ def load_solid(path: Path) -> Solid:
     Raises `ValueError` for a file that trimesh cannot read, or that bounds nothing.
     """
     with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF or GLB file"):
-        mesh = trimesh.load(path, force="mesh", skip_materials=True, process=False)
+        mesh: Any = trimesh.load(path, force="mesh", skip_materials=True, process=False)
         soup = normalised(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
     surface = outer_surface(soup)
     if surface.area < 0.05 * soup.area:
@@ -57,7 +58,7 @@ def load_solid(path: Path) -> Solid:
 
 def turned(solid: Solid, degrees: float) -> Solid:
     """The solid rotated about the y axis."""
-    return _mapped(solid, trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
+    return _mapped(solid, np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0])))
 
 
 def stretched(solid: Solid, factors: Float[np.ndarray, "3"]) -> Solid:
@@ -135,7 +136,7 @@ def _quartered(triangles: np.ndarray) -> np.ndarray:
 
 def _winding(soup: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
     vertices, faces = np.asarray(soup.vertices, np.float64), np.asarray(soup.faces, np.int64)
-    return igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points, np.float64))
+    return np.asarray(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points, np.float64)))
 
 
 def _inside(winding: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.solid import Solid
 from distrace.errors import explained
-from distrace.files import written
+from distrace.files import save_arrays
 
 
 @dataclass(frozen=True)
@@ -63,17 +64,15 @@ def load_view(path: Path) -> View:
 def save_view(path: Path, view: View) -> None:
     arrays = {"depth": view.depth, "intrinsics": view.camera.intrinsics, "T_world_camera": view.camera.T_world_camera}
     arrays |= {name: image for name, image in (("mask", view.mask), ("normal", view.normal)) if image is not None}
-    with written(path) as file:
-        np.savez_compressed(file, **{name: array.numpy() for name, array in arrays.items()})
+    save_arrays(path, arrays)
 
 
 def observe(solid: Solid, camera: Camera) -> View:
     """What the camera sees of a mesh's outer surface, by Embree's ray casting: nothing of ours but the camera."""
     rays = camera.rays()
     origins, directions = rays.origins.reshape(-1, 3).numpy(), rays.directions.reshape(-1, 3).numpy()
-    faces, pixels, points = solid.surface.ray.intersects_id(
-        origins, directions, multiple_hits=False, return_locations=True
-    )
+    cast: Any = solid.surface.ray.intersects_id
+    faces, pixels, points = cast(origins, directions, multiple_hits=False, return_locations=True)
     _, depths = camera.project(torch.from_numpy(points).float())
     depth = torch.full((camera.height * camera.width,), torch.inf)
     depth[pixels] = depths
