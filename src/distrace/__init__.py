@@ -3,9 +3,14 @@
 from distrace.camera import Camera as Camera
 from distrace.checkpoint import Model as Model
 from distrace.checkpoint import load_model as load_model
+from distrace.data.view import View as View
+from distrace.data.view import load_view as load_view
 from distrace.field import SDF as SDF
 from distrace.field import chunked as chunked
 from distrace.field import placed as placed
+from distrace.fit import FitConfig as FitConfig
+from distrace.fit import fit_shape as fit_shape
+from distrace.fit import prior_of as prior_of
 from distrace.mesh import MeshConfig as MeshConfig
 from distrace.mesh import extract_mesh as extract_mesh
 from distrace.metrics import chamfer as chamfer

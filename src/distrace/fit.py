@@ -42,6 +42,15 @@ class FitConfig:
             given = f"{self.iterations} iterations and {self.starts} starts"
             raise ValueError(f"{given} were asked for; both must be at least 1")
 
+    @property
+    def tried(self) -> int:
+        """Iterations of each start before the choice; the best has at least one left to go on."""
+        return min(self.trial, self.iterations - 1) if self.starts > 1 else 0
+
+    @property
+    def total(self) -> int:
+        return self.iterations + self.tried * (self.starts - 1)
+
 
 @dataclass(frozen=True)
 class Prior:
@@ -89,11 +98,10 @@ def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: Fit
     """
     if not views:
         raise ValueError("no view was given; fitting needs at least one")
-    trial = min(config.trial, config.iterations - 1) if config.starts > 1 else 0  # the best has a step left to go on
     runs, trials = [], []
     for start in range(config.starts):
         run = _descend(decoder, views, prior, config, start)
-        for step in islice(run, trial):
+        for step in islice(run, config.tried):
             yield step
             trials.append(step)
         runs.append(run)

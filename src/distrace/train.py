@@ -32,6 +32,11 @@ class TrainConfig:
     bfloat16: bool = False
     seed: int = 0
 
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.samples_per_step < 1 or not 0 <= self.seed < 2**31:
+            given = f"{self.steps} steps of {self.samples_per_step} samples with seed {self.seed}"
+            raise ValueError(f"{given} were asked for; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
+
 
 @dataclass(frozen=True)
 class Samples:

@@ -26,14 +26,32 @@ OBSERVATIONS = files("distrace") / "observations"
 DEMO_POINTS = 100
 
 
+Surface = trimesh.Trimesh | np.ndarray
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be completed, and how."""
+
+    model: Model
+    full: View  # all that was observed
+    known: View  # what may be used of it
+    truth: Surface | None
+    fit: FitConfig
+    mesh: MeshConfig
+
+
 @dataclass(frozen=True)
 class Outcome:
     """A fit, and everything that it took."""
 
     steps: list[Step]
-    evaluations: int
     mesh: trimesh.Trimesh
     chamfer: Chamfer | None
+
+    @property
+    def evaluations(self) -> int:
+        return sum(step.evaluations for step in self.steps)
 
 
 @dataclass(frozen=True)
@@ -54,18 +72,12 @@ class Complete:
 
     def run(self) -> None:
         run = start(self.out, self.device)
+        fit = FitConfig(iterations=self.iterations, starts=self.starts, seed=self.seed)
+        mesh = MeshConfig(self.resolution, device=run.device)
         full = load_view(self.observation)
+        known = _known(full, self.points, self.ignore, self.seed)
         truth = None if self.reference is None else _reference(self.reference)
-        config = FitConfig(iterations=self.iterations, starts=self.starts, seed=self.seed)
-        _complete(
-            run,
-            opened(self.model, run.device),
-            _known(full, self.points, self.ignore, self.seed),
-            full,
-            truth,
-            config,
-            self.resolution,
-        )
+        _complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh))
 
 
 @dataclass(frozen=True)
@@ -83,7 +95,8 @@ class Demo:
         truth = _reference(Path(str(OBSERVATIONS / f"{name}.ply")))
         console.print(f"completing [bold]{name}[/bold] from {DEMO_POINTS} depths and its silhouette")
         known = _known(full, DEMO_POINTS, ("normal",), self.seed)
-        _complete(run, opened("sofas", run.device), known, full, truth, FitConfig(seed=self.seed), 128)
+        fit, mesh = FitConfig(seed=self.seed), MeshConfig(128, device=run.device)
+        _complete(run, Task(opened("sofas", run.device), full, known, truth, fit, mesh))
 
 
 def _known(full: View, points: int | None, ignore: tuple[str, ...], seed: int) -> View:
@@ -93,7 +106,7 @@ def _known(full: View, points: int | None, ignore: tuple[str, ...], seed: int) -
     return replace(known, **{name: None for name in ignore})
 
 
-def _reference(path: Path) -> trimesh.Trimesh | np.ndarray:
+def _reference(path: Path) -> Surface:
     with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface"):
         loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):
@@ -101,28 +114,16 @@ def _reference(path: Path) -> trimesh.Trimesh | np.ndarray:
         return loaded if len(getattr(loaded, "faces", ())) else np.asarray(loaded.vertices, dtype=np.float64)
 
 
-def _complete(
-    run: Run,
-    model: Model,
-    known: View,
-    full: View,
-    truth: trimesh.Trimesh | np.ndarray | None,
-    config: FitConfig,
-    resolution: int,
-) -> None:
-    prior = prior_of(model.codes)
-    outcome = _fitted(run, model, known, truth, config, resolution)
-    code = outcome.steps[-1].code
+def _complete(run: Run, task: Task) -> None:
+    outcome = _fitted(task)
+    last = outcome.steps[-1]
     save_mesh(run.out / "mesh.ply", outcome.mesh)
     with written(run.out / "code.npy") as file:
-        np.save(file, code.cpu().numpy())
-    camera = full.camera.to(run.device)
-    with torch.no_grad():
-        before, after = (report.View.of(render(model.field(shape), camera)) for shape in (prior.mean, code))
-    shading.save_png(run.out / "shaded.png", after.shaded)
+        np.save(file, last.code.cpu().numpy())
+    page = _story(task, outcome)
+    shading.save_png(run.out / "shaded.png", page.after.shaded)
     with written(run.out / "report.html") as file:
-        file.write(report.completion_page(_story(run, known, full, before, after, truth, outcome, config)).encode())
-    last = outcome.steps[-1]
+        file.write(report.completion_page(page).encode())
     facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
     distances = outcome.chamfer
     if distances:
@@ -131,40 +132,33 @@ def _complete(
     run.finish({**facts, "setup_evaluations": 0})
 
 
-def _fitted(
-    run: Run, model: Model, known: View, truth: trimesh.Trimesh | np.ndarray | None, config: FitConfig, resolution: int
-) -> Outcome:
-    trials = config.trial * (config.starts - 1) if config.starts > 1 else 0
+def _fitted(task: Task) -> Outcome:
     steps: list[Step] = []
-    with progress("fitting", config.iterations + trials) as bar:
-        for step in fit_shape(model.decoder, [known], prior_of(model.codes), config):
+    with progress("fitting", task.fit.total) as bar:
+        for step in fit_shape(task.model.decoder, [task.known], prior_of(task.model.codes), task.fit):
             steps.append(step)
             bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
-    mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution, device=run.device))
-    evaluations = sum(step.evaluations for step in steps)
-    return Outcome(steps, evaluations, mesh, None if truth is None else chamfer(mesh, truth))
+    mesh = extract_mesh(task.model.field(steps[-1].code), task.mesh)
+    return Outcome(steps, mesh, None if task.truth is None else chamfer(mesh, task.truth))
 
 
-def _story(
-    run: Run,
-    known: View,
-    full: View,
-    before: report.View,
-    after: report.View,
-    truth: trimesh.Trimesh | np.ndarray | None,
-    outcome: Outcome,
-    config: FitConfig,
-) -> report.Completion:
+def _story(task: Task, outcome: Outcome) -> report.Completion:
+    """All that the page shows."""
+    known, full, truth, last = task.known, task.full, task.truth, outcome.steps[-1]
     losses: dict[str, list[float]] = {}
     for step in outcome.steps:
         losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
+    with torch.no_grad():
+        codes = (prior_of(task.model.codes).mean, last.code)
+        camera = full.camera.to(task.mesh.device)
+        before, after = (report.View.of(render(task.model.field(code), camera)) for code in codes)
     facts = {
         "depths used": str(int(known.seen.sum())),
         "silhouette": "none" if known.mask is None else "used",
-        "iterations": f"{config.iterations}, after {config.trial} of each of {config.starts} starts",
+        "iterations": f"{task.fit.iterations}, after {task.fit.tried} of each of {task.fit.starts} starts",
         "evaluations of the network": f"{outcome.evaluations:,}",
-        "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {run.device}",
-        "seed": str(config.seed),
+        "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
+        "seed": str(task.fit.seed),
     }
     return report.Completion(
         title="A shape completed from one depth view",

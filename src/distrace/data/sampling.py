@@ -59,6 +59,9 @@ def run_one(job: Job) -> Doubt:
 
     A mesh that cannot be read, or whose signs are beyond hope, has a report that says why, and no samples.
     """
+    if not job.mesh.is_file():
+        missing = f"{job.mesh} is missing"  # not recorded: it may be there next time
+        return Doubt(job.shape.name, 0, 0.0, 1.0, False, missing)
     try:
         solid = turned(load_solid(job.mesh), job.shape.turn)
     except ValueError as error:
