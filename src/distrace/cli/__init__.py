@@ -31,7 +31,6 @@ ABOUT = "Render neural signed distance functions, and fit them to what was obser
 
 
 def main() -> None:
-    torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers, which made training 2.3 times slower
     try:
         _run(sys.argv[1:])
     except KeyboardInterrupt:

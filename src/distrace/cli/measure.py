@@ -11,7 +11,7 @@ from rich.table import Table
 from distrace import shading
 from distrace.bench import Row, ablation, poster_view
 from distrace.cli.common import ModelName, opened
-from distrace.cli.console import Run, console, machine, progress, start
+from distrace.cli.console import Run, console, machine, progress, save_json, start
 from distrace.data.split import read_split
 from distrace.evaluate import (
     METHODS,
@@ -81,6 +81,7 @@ class Evaluate:
         with progress(self.name, count) as bar:
             for result in results:
                 kept.append(result)
+                save_json(run.out / "rows.json", [done.row(self.model) for done in kept])
                 bar.advance(f"{result.shape}, {result.method}: {result.chamfer:.3f}")
         _record(run, self.name, self.model, kept)
 

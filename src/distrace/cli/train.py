@@ -42,6 +42,7 @@ class Train:
     device: str = "cpu"
 
     def run(self) -> None:
+        torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers: training was 2.3 times slower
         run = start(self.out, self.device)
         loaded = load_samples(_sample_files(self.samples, self.split)).to(run.device)
         resumed = load_training(self.out, loaded.names, run.device)
