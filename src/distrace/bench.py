@@ -82,13 +82,13 @@ def _bisected(sdf: SDF, rays: Rays, inside: Tensor) -> Tensor:
 
 
 def ablation(
-    sdf: SDF, camera: Camera, strategies: dict[str, TraceConfig], radius: float = 1.0
+    sdf: SDF, camera: Camera, strategies: dict[str, TraceConfig], radius: float = 1.0, repeats: int = 5
 ) -> Iterator[tuple[Row, Buffers]]:
-    """Measures each strategy on one view: times are medians of five runs after one to warm up."""
+    """Measures each strategy on one view: times are medians of some runs after one to warm up."""
     rays = camera.rays()
     truth = camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius)))
     for name, config in strategies.items():
-        buffers, seconds, runs = _timed(sdf, camera, radius, config)
+        buffers, seconds, runs = _timed(sdf, camera, radius, config, repeats)
         yield measured(name, buffers, truth, seconds, runs), buffers
 
 
@@ -112,9 +112,10 @@ def measured(name: str, buffers: Buffers, truth: Float[Tensor, "height width"], 
 
 
 @torch.no_grad()
-def _timed(sdf: SDF, camera: Camera, radius: float, config: TraceConfig) -> tuple[Buffers, float, int]:
+def _timed(sdf: SDF, camera: Camera, radius: float, config: TraceConfig, repeats: int) -> tuple[Buffers, float, int]:
+    """The last rendering, the median time, and of how many runs; a single run is not warmed up for."""
     seconds: list[float] = []
-    while len(seconds) < 6 and not (seconds and seconds[0] > LONG):
+    while len(seconds) < (repeats + 1 if repeats > 1 else 1) and not (seconds and seconds[0] > LONG):
         began = time.perf_counter()
         buffers = render(sdf, camera, radius=radius, config=config)
         if buffers.trace.distance.is_cuda:

@@ -35,6 +35,7 @@ class Bench:
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
     size: int = 512
+    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over half a minute runs once
     device: str = "cpu"
 
     def run(self) -> None:
@@ -43,7 +44,8 @@ class Bench:
         rows: list[Row] = []
         images = []
         with progress(self.what, len(STRATEGIES)) as bar:
-            for row, buffers in ablation(field, poster_view(self.size).to(run.device), STRATEGIES):
+            camera = poster_view(self.size).to(run.device)
+            for row, buffers in ablation(field, camera, STRATEGIES, repeats=self.repeats):
                 rows.append(row)
                 images.append(shading.error_picture(buffers.trace.evaluations.float(), 50.0))
                 bar.advance(f"{row.strategy}: {row.queries} queries")
