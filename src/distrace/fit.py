@@ -98,9 +98,10 @@ def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: Fit
     """
     if not views:
         raise ValueError("no view was given; fitting needs at least one")
+    pools = [Pool.of(view) for view in views]
     runs, trials = [], []
     for start in range(config.starts):
-        run = _descend(decoder, views, prior, config, start)
+        run = _descend(decoder, pools, prior, config, start)
         for step in islice(run, config.tried):
             yield step
             trials.append(step)
@@ -115,13 +116,12 @@ def _best(trials: list[Step]) -> int:
     return min(starts, key=lambda start: sum(recent[start]) / len(recent[start]))
 
 
-def _descend(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig, start: int) -> Iterator[Step]:
+def _descend(decoder: Decoder, pools: list[Pool], prior: Prior, config: FitConfig, start: int) -> Iterator[Step]:
     """Adam from one start: the mean shape first, then draws from the prior."""
     random = torch.Generator().manual_seed(config.seed + start)
     w = torch.randn(prior.basis.shape[1], generator=random) * (0.0 if start == 0 else 0.7)
     w = w.to(prior.mean.device).requires_grad_()
     optimiser = torch.optim.Adam([w])
-    pools = [Pool.of(view) for view in views]
     for iteration in range(config.iterations):
         began = time.perf_counter()
         optimiser.param_groups[0]["lr"] = (
