@@ -17,7 +17,7 @@ from distrace.render import Buffers, render
 from distrace.trace import TraceConfig
 
 OUTLIER = 1e-3
-LONG = 30.0  # seconds; what takes longer is run once
+LONG = 60.0  # seconds; what takes longer is run once
 SMALLEST_STEP = 5e-5
 
 

@@ -18,7 +18,7 @@ from distrace.fit import FitConfig, Step, fit_shape, prior_of
 from distrace.fit_samples import around_points, fit_samples
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
-from distrace.shading import Picture, grid, shaded_picture
+from distrace.shading import Picture, grid
 
 METHODS = ("deepsdf", "ours", "ours+mask")
 OBSERVATION_SIZE = 256
@@ -130,8 +130,6 @@ def picture_of(results: list[Result]) -> Picture:
 
 def drawn(mesh: trimesh.Trimesh) -> Picture:
     """A mesh as the poster's camera sees it."""
-    camera = poster_view(OBSERVATION_SIZE)
-    view = observe(Solid(mesh, mesh), camera)
-    assert view.normal is not None
-    assert view.mask is not None
-    return shaded_picture(view.normal, view.mask, camera.rays().directions)
+    picture = observe(Solid(mesh, mesh), poster_view(OBSERVATION_SIZE)).shaded
+    assert picture is not None
+    return picture

@@ -12,6 +12,7 @@ from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
 from distrace.files import save_arrays, written
 from distrace.render import Buffers
+from distrace.report import View
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
@@ -21,17 +22,12 @@ def opened(name: str, device: torch.device) -> Model:
     return load_model(name).to(device)
 
 
-def picture(buffers: Buffers) -> shading.Picture:
-    """The shaded view."""
-    return shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
-
-
 def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:
     pictures = {
         "depth": shading.depth_picture(buffers.depth),
         "normal": shading.normal_picture(buffers.normal, buffers.mask, camera.T_world_camera),
         "mask": shading.mask_picture(buffers.mask),
-        "shaded": picture(buffers),
+        "shaded": View.of(buffers).shaded,
     }
     for name, image in pictures.items():
         shading.save_png(folder / f"{name}.png", image)

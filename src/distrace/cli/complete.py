@@ -179,7 +179,6 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
 
 def _truth_view(full: View) -> report.View | None:
     """What the observation holds beyond what was used, where it holds all of it."""
-    if full.mask is None or full.normal is None:
+    if full.mask is None or full.normal is None or full.shaded is None:
         return None
-    shaded = shading.shaded_picture(full.normal, full.mask, full.camera.rays().directions)
-    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), shaded)
+    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)

@@ -1,6 +1,7 @@
 """What all commands share: progress, devices, and the result that each leaves behind."""
 
 import json
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -116,3 +117,8 @@ def machine() -> str:
     lines = cpu.read_text().splitlines() if cpu.exists() else []
     name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
     return f"{name}, {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
+
+
+def origin() -> dict[str, str]:
+    """What a recorded table was made by, and on."""
+    return {"command": " ".join(["distrace", *sys.argv[1:]]), "machine": machine()}

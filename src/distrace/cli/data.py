@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from distrace.cli.common import Flag
-from distrace.cli.console import console, progress, save_json, start
+from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, sampling
 from distrace.data.samples import Doubt
 from distrace.data.split import every_mesh, read_split
@@ -59,8 +59,6 @@ class Sample:
                 bar.advance(report.name)
                 if not report.usable:
                     console.print(f"left out {report.name}: {report.reason}", markup=False)
-        save_json(
-            self.out / "report.json", [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
-        )
+        rows = [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
         usable = sum(report.usable for report in reports)
-        run.finish({"shapes": usable, "left_out": len(reports) - usable})
+        run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows, **origin()})

@@ -1,6 +1,5 @@
 """`bench` and `evaluate`: tables of results, as JSON, as pictures and in the terminal."""
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -11,7 +10,7 @@ from rich.table import Table
 from distrace import shading
 from distrace.bench import Row, ablation, poster_view
 from distrace.cli.common import ModelName, opened
-from distrace.cli.console import Run, console, machine, progress, save_json, start
+from distrace.cli.console import Run, console, origin, progress, save_json, start
 from distrace.data.split import read_split
 from distrace.evaluate import (
     METHODS,
@@ -35,7 +34,7 @@ class Bench:
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
     size: int = 512
-    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over half a minute runs once
+    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
     device: str = "cpu"
 
     def run(self) -> None:
@@ -52,7 +51,7 @@ class Bench:
         shading.save_png(run.out / "evaluations.png", shading.side_by_side(images))
         recorded = [{"model": self.model, **row.asdict()} for row in rows]
         _show(recorded)
-        run.finish({"rows": recorded, **_origin(), "evaluations": sum(row.queries for row in rows)})
+        run.finish({"rows": recorded, **origin(), "evaluations": sum(row.queries for row in rows)})
 
 
 @dataclass(frozen=True)
@@ -105,11 +104,7 @@ def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
         section("Shapes", figure(sheet, "true surface, then each method")),
     ]
     (run.out / "index.html").write_text(page(f"{name}: {model}", lead, parts))
-    run.finish({"rows": rows, "summary": totals, **_origin()})
-
-
-def _origin() -> dict[str, str]:
-    return {"command": " ".join(["distrace", *sys.argv[1:]]), "machine": machine()}
+    run.finish({"rows": rows, "summary": totals, **origin()})
 
 
 def _show(rows: list[dict]) -> None:

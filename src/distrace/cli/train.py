@@ -9,11 +9,11 @@ import tyro
 
 from distrace.bench import poster_view
 from distrace.checkpoint import Model, save_experiment
-from distrace.cli.common import picture
 from distrace.cli.console import Run, console, progress, start
 from distrace.data.split import read_split
 from distrace.decoder import NetworkSpecs
 from distrace.render import render
+from distrace.report import View
 from distrace.resume import load_training, save_training
 from distrace.shading import save_png, side_by_side
 from distrace.train import Samples, TrainConfig, Training, faster_in_bfloat16, load_samples
@@ -104,4 +104,4 @@ def _save(run: Run, samples: Samples, training: Training, config: TrainConfig) -
     camera = poster_view(128).to(run.device)
     shown = range(0, len(codes), max(len(codes) // PREVIEWED, 1))
     with torch.no_grad():
-        save_png(run.out / "preview.png", side_by_side([picture(render(model.field(n), camera)) for n in shown]))
+        save_png(run.out / "preview.png", side_by_side([View.of(render(model.field(n), camera)).shaded for n in shown]))

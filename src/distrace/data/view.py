@@ -13,6 +13,7 @@ from distrace.camera import Camera
 from distrace.data.solid import Solid
 from distrace.errors import explained
 from distrace.files import save_arrays
+from distrace.shading import Picture, shaded_picture
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,13 @@ class View:
         """The observed points, in the world."""
         rays = self.camera.rays()
         return rays.at(self.depth / self.camera.cosines())[self.seen]
+
+    @property
+    def shaded(self) -> Picture | None:
+        """As clay, where normals and mask are known."""
+        if self.normal is None or self.mask is None:
+            return None
+        return shaded_picture(self.normal, self.mask, self.camera.rays().directions)
 
     def sparse(self, count: int, seed: int = 0) -> "View":
         """The same view with only `count` of its depths, drawn at random."""
