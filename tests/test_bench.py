@@ -10,8 +10,7 @@ from distrace.camera import Camera
 from distrace.field import Counted
 from distrace.primitives import box, capsule, sphere, union
 from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.render import Buffers, render
-from distrace.trace import STRATEGIES
+from distrace.render import STRATEGIES, Buffers, render
 
 COLUMNS = ["strategy", "queries", "setup_queries", "seconds", "hits", "iou", "depth_mean", "depth_p99", "depth_max"]
 COLUMNS += ["outliers", "runs"]
@@ -93,6 +92,7 @@ def test_queries_fall_in_the_published_order(table: list[tuple[Row, Buffers]]) -
     entering = int(meet_sphere(poster_view(64).rays()).meets.sum())
     assert queries["parallel"] == 50 * entering, "every ray at every step"
     assert order[-1] < order[0] / 5
+    assert queries["fast"] < order[-1] / 1.5, "of 64 pixels a side: more than half of it is for the lattice"
 
 
 def test_queries_are_all_that_the_field_was_asked_for() -> None:
@@ -101,7 +101,7 @@ def test_queries_are_all_that_the_field_was_asked_for() -> None:
         with torch.no_grad():
             trace = render(counted, poster_view(24), config=config).trace
         assert trace.total_evaluations == counted.evaluations, name
-        assert (trace.setup_evaluations > 0) == (config.coarse_levels > 0)
+        assert (trace.setup_evaluations > 0) == (name in ("coarse_to_fine", "fast"))
 
 
 def test_times_are_medians_of_five_runs_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:

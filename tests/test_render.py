@@ -8,9 +8,10 @@ from torch import Tensor
 
 from distrace import primitives
 from distrace.camera import Camera
+from distrace.picture import FastConfig
 from distrace.rays import meet_sphere
-from distrace.render import Buffers, render, render_rays
-from distrace.trace import DYNAMIC, STRATEGIES, Outcome, TraceConfig
+from distrace.render import STRATEGIES, Buffers, Config, render, render_rays
+from distrace.trace import COARSE_TO_FINE, DYNAMIC, Outcome
 
 f64 = torch.float64
 EXACT = replace(DYNAMIC, steps=500, tolerance=1e-9)
@@ -33,14 +34,20 @@ def seen(buffers: Buffers) -> Tensor:
     return depth + buffers.normal[..., :2].sum() + buffers.points.sum() + clearance
 
 
+def exactly(config: Config) -> Config:
+    if isinstance(config, FastConfig):
+        return replace(config, tolerance=1e-9, march=replace(config.march, tolerance=1e-9))
+    return replace(config, tolerance=1e-9, steps=300)
+
+
 @every_strategy
-def test_the_images_of_a_sphere_are_its_closed_forms(config: TraceConfig) -> None:
+def test_the_images_of_a_sphere_are_its_closed_forms(config: Config) -> None:
     camera, radius = view(32), 0.5
-    buffers = render(primitives.sphere(radius), camera, config=replace(config, tolerance=1e-9, steps=300))
+    buffers = render(primitives.sphere(radius), camera, config=exactly(config))
     true = meet_sphere(camera.rays(), radius)
     assert buffers.mask.any()
     assert not (buffers.mask & ~true.meets).any()
-    assert (buffers.mask != true.meets).sum() <= (2 if config.coarse_levels else 0)  # by the outline
+    assert (buffers.mask != true.meets).sum() <= (2 if config is COARSE_TO_FINE else 0)  # by the outline
     expected = torch.where(buffers.mask, true.near, torch.inf)
     torch.testing.assert_close(buffers.distance, expected, rtol=0, atol=1e-6)
     torch.testing.assert_close(buffers.depth, expected * camera.cosines(), rtol=0, atol=1e-6)
@@ -63,7 +70,7 @@ def test_background_is_inf_and_depth_is_z() -> None:
 
 
 @every_strategy
-def test_clearance_is_the_least_value_on_every_ray_that_misses(config: TraceConfig) -> None:
+def test_clearance_is_the_least_value_on_every_ray_that_misses(config: Config) -> None:
     """Also where a coarse ray has marched past it: it was off by 0.06 there."""
     camera = view(32)
     buffers = render(primitives.sphere(0.3), camera, config=config)
@@ -77,7 +84,7 @@ def test_clearance_is_the_least_value_on_every_ray_that_misses(config: TraceConf
 
 
 @every_strategy
-def test_a_view_of_nothing_has_every_buffer_and_every_gradient(config: TraceConfig) -> None:
+def test_a_view_of_nothing_has_every_buffer_and_every_gradient(config: Config) -> None:
     radius = torch.tensor(0.5, dtype=f64, requires_grad=True)
     nowhere = primitives.sphere(radius, torch.tensor([0, 9.0, 0], dtype=f64))
     for sdf, camera in ((primitives.sphere(radius), away()), (nowhere, view(8))):
@@ -98,7 +105,7 @@ def test_a_view_of_nothing_has_every_buffer_and_every_gradient(config: TraceConf
 
 @every_strategy
 @pytest.mark.parametrize("sdf", [primitives.sphere(0.5), primitives.box(torch.tensor([0.4, 0.5, 0.3], dtype=f64))])
-def test_gradients_hold_no_nan_when_part_of_the_image_is_background(config: TraceConfig, sdf) -> None:
+def test_gradients_hold_no_nan_when_part_of_the_image_is_background(config: Config, sdf) -> None:
     start = view(16)
     camera = replace(
         start,
@@ -153,7 +160,7 @@ def test_the_gradients_of_images_are_those_of_their_closed_forms() -> None:
 
 
 @every_strategy
-def test_cameras_in_a_batch_see_what_each_sees_alone(config: TraceConfig) -> None:
+def test_cameras_in_a_batch_see_what_each_sees_alone(config: Config) -> None:
     cameras = [view(12, azimuth) for azimuth in (0, 50, 200)]
     box = primitives.box(torch.tensor([0.5, 0.3, 0.2], dtype=f64))
     batch = Camera.from_matrices(

@@ -16,7 +16,7 @@ from distrace.trace import (
     AGGRESSIVE,
     COARSE_TO_FINE,
     DYNAMIC,
-    STRATEGIES,
+    MARCHES,
     Outcome,
     Trace,
     TraceConfig,
@@ -30,7 +30,7 @@ scene = primitives.union(
 )
 slow_scene = reference.union(reference.sphere(CENTRE, RADIUS), reference.box(EXTENTS))
 EXACT = replace(DYNAMIC, steps=1000, tolerance=1e-9)  # a scale above 1 may step across an edge that it grazes
-every_strategy = pytest.mark.parametrize("config", STRATEGIES.values(), ids=STRATEGIES)
+every_strategy = pytest.mark.parametrize("config", MARCHES.values(), ids=MARCHES)
 
 
 def view(size: int = 24, dtype: torch.dtype = f64, **changes) -> Camera:
@@ -151,9 +151,9 @@ def test_a_box_is_met_at_its_closed_form(azimuth: float, elevation: float) -> No
     torch.testing.assert_close(traced.distance[traced.hit], enters[traced.hit], rtol=0, atol=1e-6)
 
 
-@given(st.permutations(range(256)), st.integers(1, 256), st.sampled_from(sorted(STRATEGIES)))
+@given(st.permutations(range(256)), st.integers(1, 256), st.sampled_from(sorted(MARCHES)))
 def test_a_rays_result_does_not_depend_on_the_rays_beside_it(order: list[int], count: int, strategy: str) -> None:
-    config = STRATEGIES[strategy]
+    config = MARCHES[strategy]
     rays, chosen = view(16).rays().flat(), torch.tensor(order[:count])
     together, apart = trace(scene, rays, config), trace(scene, rays[chosen], config)
     assert (together.outcome[chosen] == apart.outcome).all()
@@ -166,12 +166,12 @@ def test_a_rays_result_does_not_depend_on_the_rays_beside_it(order: list[int], c
 def test_each_strategy_of_the_table_asks_less_than_the_one_before() -> None:
     camera = view(64, torch.float32)
     counts = []
-    for config in STRATEGIES.values():
+    for config in MARCHES.values():
         watched = Watched(primitives.sphere(0.5))
         traced = render(watched, camera, config=config).trace
         assert traced.total_evaluations == watched.count  # nothing is asked that is not counted
         counts.append(watched.count)
-    assert list(STRATEGIES) == ["parallel", "dynamic", "aggressive", "coarse_to_fine"]
+    assert list(MARCHES) == ["parallel", "dynamic", "aggressive", "coarse_to_fine"]
     assert counts == sorted(counts, reverse=True)
     assert counts[0] == 50 * meet_sphere(camera.rays()).meets.sum()
     assert counts[1] < counts[0] / 2
@@ -215,7 +215,7 @@ def test_a_camera_on_the_surface_hits_it_at_once_and_never_behind_itself() -> No
 
 def test_a_tangent_ray_ends_by_the_surface_or_without_a_hit() -> None:
     """Along it f = √(r² + s²) − r, which stays below ε for √(2 r ε) around the point of touch."""
-    for config in STRATEGIES.values():
+    for config in MARCHES.values():
         traced = trace(primitives.sphere(0.5), ray([0, 0.5, 3], [0, 0, -1]), config)
         assert traced.outcome.item() in (Outcome.HIT, Outcome.EXHAUSTED)
         if traced.hit.item():

@@ -11,6 +11,8 @@ from distrace.field import placed as placed
 from distrace.fit import FitConfig as FitConfig
 from distrace.fit import fit_shape as fit_shape
 from distrace.fit import prior_of as prior_of
+from distrace.lattice import Lattice as Lattice
+from distrace.lattice import LatticeConfig as LatticeConfig
 from distrace.mesh import MeshConfig as MeshConfig
 from distrace.mesh import extract_mesh as extract_mesh
 from distrace.metrics import chamfer as chamfer

@@ -1,7 +1,7 @@
 """Measuring the strategies of tracing on one view, against a reference that takes no chances."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from statistics import median
 
@@ -13,8 +13,7 @@ from distrace.camera import Camera
 from distrace.field import SDF
 from distrace.metrics import depth_errors, iou
 from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.render import Buffers, render
-from distrace.trace import TraceConfig
+from distrace.render import Buffers, Config, render
 
 OUTLIER = 1e-3
 LONG = 60.0  # seconds; what takes longer is run once
@@ -82,7 +81,7 @@ def _bisected(sdf: SDF, rays: Rays, inside: Tensor) -> Tensor:
 
 
 def ablation(
-    sdf: SDF, camera: Camera, strategies: dict[str, TraceConfig], radius: float = 1.0, repeats: int = 5
+    sdf: SDF, camera: Camera, strategies: Mapping[str, Config], radius: float = 1.0, repeats: int = 5
 ) -> Iterator[tuple[Row, Buffers]]:
     """Measures each strategy on one view: times are medians of some runs after one to warm up."""
     rays = camera.rays()
@@ -112,7 +111,7 @@ def measured(name: str, buffers: Buffers, truth: Float[Tensor, "height width"], 
 
 
 @torch.no_grad()
-def _timed(sdf: SDF, camera: Camera, radius: float, config: TraceConfig, repeats: int) -> tuple[Buffers, float, int]:
+def _timed(sdf: SDF, camera: Camera, radius: float, config: Config, repeats: int) -> tuple[Buffers, float, int]:
     """The last rendering, the median time, and of how many runs; a single run is not warmed up for."""
     seconds: list[float] = []
     while len(seconds) < (repeats + 1 if repeats > 1 else 1) and not (seconds and seconds[0] > LONG):

@@ -139,6 +139,24 @@ class Camera:
         size = math.ceil(self.height * factor), math.ceil(self.width * factor)
         return replace(self, intrinsics=self.intrinsics * scale, height=size[0], width=size[1])
 
+    def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
+        """The same camera with a part of its sensor."""
+        moved = self.intrinsics.clone()
+        moved[..., 0, 2] -= left
+        moved[..., 1, 2] -= top
+        return replace(
+            self, intrinsics=moved, height=min(height, self.height - top), width=min(width, self.width - left)
+        )
+
+    def scaled(self, factor: float) -> "Camera":
+        """The same view of a world whose lengths are × factor."""
+        pose = self.T_world_camera.clone()
+        pose[..., :3, 3] *= factor
+        return replace(self, T_world_camera=pose)
+
+    def detach(self) -> "Camera":
+        return replace(self, intrinsics=self.intrinsics.detach(), T_world_camera=self.T_world_camera.detach())
+
     def to(self, device: torch.device | str) -> "Camera":
         return replace(self, intrinsics=self.intrinsics.to(device), T_world_camera=self.T_world_camera.to(device))
 

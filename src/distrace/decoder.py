@@ -1,5 +1,6 @@
 """The DeepSDF network: a point and a shape's code to a signed distance (Park et al., CVPR 2019, section 4)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -10,8 +11,14 @@ from torch.nn.utils.parametrizations import weight_norm
 
 from distrace.field import SDF, chunked
 
+QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
+ROUND = 16  # widths that processors like
+SAMPLED = 8  # deviations are measured at every so many points
 CPU_CHUNK = 4096  # a layer's activations then stay in the cache: 20 µs a point, against 45 µs in batches of 250 K
 GPU_CHUNK = 1 << 20
+
+
+Layer = tuple[Tensor, Tensor]  # weight and bias
 
 
 @dataclass(frozen=True)
@@ -66,7 +73,7 @@ class Decoder(nn.Module):
         """Values in (-1, 1). A code with batch axes of size 1 enters the first layer once, not per point."""
         return self._run(self._folded(code), points)
 
-    def field(self, code: Float[Tensor, "length"]) -> SDF:
+    def field(self, code: Float[Tensor, "length"]) -> "ShapeField":
         """The signed distance field of one shape, the constant code folded into the biases of the layers it enters.
 
         Raises `ValueError` for a code of another length.
@@ -74,11 +81,9 @@ class Decoder(nn.Module):
         if code.shape != (self.specs.code_length,):
             takes = [self.specs.code_length]
             raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
-        layers = self._folded(code)
-        size = CPU_CHUNK if code.device.type == "cpu" else GPU_CHUNK
-        return chunked(lambda points: self._run(layers, points), size)
+        return ShapeField(self, self._folded(code))
 
-    def _folded(self, code: Tensor) -> list[tuple[Tensor, Tensor]]:
+    def _folded(self, code: Tensor) -> list[Layer]:
         """Each layer's weight without the code's columns, and its bias with what the code adds."""
         layers, length = [], self.specs.code_length
         for layer in range(self.depth):
@@ -91,20 +96,69 @@ class Decoder(nn.Module):
             layers.append((weight, bias))
         return layers
 
-    def _run(self, layers: list[tuple[Tensor, Tensor]], points: Tensor) -> Tensor:
+    def _run(self, layers: list[Layer], points: Tensor, watch: Callable[[int, Tensor], None] | None = None) -> Tensor:
         x = points
         for layer, (weight, bias) in enumerate(layers):
             if layer and (layer in self.specs.latent_in or self.specs.xyz_in_all):
                 x = torch.cat([x, points], dim=-1)
             x = F.linear(x, weight, bias) if bias.dim() == 1 else F.linear(x, weight) + bias
             if layer < self.depth - 1:
+                if watch:
+                    watch(layer, x)
                 x = self._activated(x, layer)
         x = x[..., 0]
         return torch.tanh(torch.tanh(x) if self.specs.use_tanh else x)
 
     def _activated(self, x: Tensor, layer: int) -> Tensor:
         norm = getattr(self, f"bn{layer}", None)
-        x = F.relu(x if norm is None else norm(x))
+        x = F.relu(x if norm is None else norm(x), inplace=not torch.is_grad_enabled())
         if layer in self.specs.dropout:
             x = F.dropout(x, self.specs.dropout_prob, self.training)
         return x
+
+
+class ShapeField:
+    """The field of one shape: a decoder whose layers have the shape's code folded in."""
+
+    def __init__(self, decoder: Decoder, layers: list[Layer]) -> None:
+        self.decoder, self.layers = decoder, layers
+        self.size = CPU_CHUNK if layers[0][0].device.type == "cpu" else GPU_CHUNK
+        self.evaluate = chunked(lambda points: decoder._run(layers, points), self.size)
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.evaluate(points)
+
+    @torch.no_grad()
+    def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
+        """Values at points, and the same field without the ReLU units that are off, by a margin, at all of them.
+
+        Around the points it has the same values to rounding, at half the cost for an 8 × 512 decoder near its surface.
+        """
+        specs, last = self.decoder.specs, len(self.layers) - 1
+        if not len(points) or (specs.norm_layers and not specs.weight_norm) or self.decoder.training:
+            return self(points), self  # a layer's norm is over all of its units
+        highest = [torch.full_like(bias, -torch.inf) for _, bias in self.layers[:last]]
+        deviation = [torch.zeros_like(bias) for _, bias in self.layers[:last]]
+
+        def watch(layer: int, x: Tensor) -> None:
+            highest[layer] = highest[layer].maximum(x.amax(0))
+            deviation[layer] = deviation[layer].maximum(x[::SAMPLED].std(0, correction=0))
+
+        values = torch.cat([self.decoder._run(self.layers, part, watch) for part in points.split(self.size)])
+        kept = [_on(*both) for both in zip(highest, deviation, strict=True)]
+        return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
+
+    def _thinned(self, layer: int, kept: list[Tensor]) -> Layer:
+        """A layer without the rows of its own units that are off, and without the columns of those before."""
+        weight, bias = self.layers[layer]
+        if layer:
+            fed = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)  # the points
+            weight = weight[:, torch.cat([kept[layer - 1], fed])]
+        return (weight[kept[layer]], bias[kept[layer]]) if layer < len(kept) else (weight.contiguous(), bias)
+
+
+def _on(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Tensor:
+    """The units that come near zero or above, and a few more for a round width."""
+    level = highest / deviation.clamp_min(1e-12)
+    count = -(-int((level > -QUIET).sum()) // ROUND) * ROUND
+    return level.topk(min(max(count, ROUND), len(level))).indices.sort().values

@@ -9,9 +9,15 @@ from torch import Tensor
 
 from distrace import pyramid, surface
 from distrace.camera import Camera
+from distrace.fast import fast_trace
 from distrace.field import SDF
+from distrace.lattice import Lattice
+from distrace.picture import FastConfig
 from distrace.rays import Rays, meet_sphere
-from distrace.trace import Trace, TraceConfig, sphere_trace
+from distrace.trace import MARCHES, Trace, TraceConfig, sphere_trace
+
+Config = TraceConfig | FastConfig
+STRATEGIES: dict[str, Config] = {**MARCHES, "fast": FastConfig()}
 
 
 @dataclass(frozen=True)
@@ -23,6 +29,7 @@ class Buffers:
     cosines: Float[Tensor, "*batch"]  # depth over distance
     trace: Trace
     radius: float
+    lattice: Lattice | None = None  # the fast tracer's, for other views of the same field
 
     @property
     def mask(self) -> Bool[Tensor, "*batch"]:
@@ -71,17 +78,29 @@ class Buffers:
         return least.masked_scatter(met, self.sdf(rays.at(closest)))
 
 
-def render(sdf: SDF, camera: Camera, *, radius: float = 1.0, config: TraceConfig = TraceConfig()) -> Buffers:
+def render(
+    sdf: SDF,
+    camera: Camera,
+    *,
+    radius: float = 1.0,
+    config: Config = FastConfig(),
+    lattice: Lattice | None = None,
+    last: Trace | None = None,
+) -> Buffers:
     """Renders a field inside a sphere of `radius` around the origin, as a camera sees it.
 
-    The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera.
-    Raises `ValueError` for a radius that is not positive.
+    The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera. The fast
+    tracer takes over what a rendering before has learnt: `lattice`, of the same field, and `last`, the trace of nearly
+    the same field by nearly the same camera. Raises `ValueError` for a radius that is not positive.
     """
     if not radius > 0:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")
+    rays = camera.rays()
+    if isinstance(config, FastConfig):
+        trace, lattice = fast_trace(sdf, camera, radius, config, lattice, last)
+        return Buffers(sdf, rays, camera.cosines(), trace, radius, lattice)
     start, setup = pyramid.starts(sdf, camera, radius, config) if config.coarse_levels else (None, 0)
     steps = max(config.steps - config.coarse_levels * config.coarse_steps, 1)
-    rays = camera.rays()
     trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), replace(config, steps=steps), start)
     trace = replace(trace, setup_evaluations=trace.setup_evaluations + setup)
     return Buffers(sdf, rays, camera.cosines(), trace, radius)

@@ -1,6 +1,7 @@
 """Sphere tracing without gradients: one march, whose configurations are DIST's strategies (Liu et al., CVPR 2020)."""
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import torch
@@ -29,6 +30,7 @@ class TraceConfig:
     step_limit: float = 0.1  # f is clamped to ± this: decoders are trained on clamped distances and know no larger one
     tolerance: float | Float[Tensor, "*batch"] = 5e-5  # also per ray, as `Camera.tolerance` gives it
     compaction: bool = True  # only rays still on their way are queried; without, every ray at every step
+    least_step: float = 0.0  # a ray that grazes the surface goes on by this at least, while it is outside
     polish: bool = True  # a ray that converged goes on to the zero of the secant through its last two samples
     coarse_levels: int = 2  # the march starts at 1 / 2^levels of the resolution …
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
@@ -42,7 +44,7 @@ PARALLEL = TraceConfig(steps=50, step_scale=1.0, compaction=False, coarse_levels
 DYNAMIC = replace(PARALLEL, compaction=True)
 AGGRESSIVE = replace(DYNAMIC, step_scale=1.5)
 COARSE_TO_FINE = replace(AGGRESSIVE, coarse_levels=2)
-STRATEGIES = {"parallel": PARALLEL, "dynamic": DYNAMIC, "aggressive": AGGRESSIVE, "coarse_to_fine": COARSE_TO_FINE}
+MARCHES = {"parallel": PARALLEL, "dynamic": DYNAMIC, "aggressive": AGGRESSIVE, "coarse_to_fine": COARSE_TO_FINE}
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,8 @@ class Trace:
     closest: Float[Tensor, "*batch"]  # the distance at which |sdf| was least
     stopped: Float[Tensor, "*batch"]  # where the march stood when it ended, whatever the outcome
     evaluations: Int[Tensor, "*batch"]  # of the field, for this ray
-    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels
+    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels, a lattice
+    slope: Float[Tensor, "*batch"] | None = None  # of f along the ray at its hit, where the tracer knows it; else NaN
 
     @property
     def hit(self) -> Bool[Tensor, "*batch"]:
@@ -65,14 +68,24 @@ class Trace:
         return self.setup_evaluations + int(self.evaluations.sum())
 
     def reshaped(self, shape: torch.Size) -> "Trace":
-        return Trace(
-            self.distance.reshape(shape),
-            self.outcome.reshape(shape),
-            self.closest.reshape(shape),
-            self.stopped.reshape(shape),
-            self.evaluations.reshape(shape),
-            self.setup_evaluations,
-        )
+        return self.of(lambda part: part.reshape(shape))
+
+    def __getitem__(self, index: Tensor | tuple) -> "Trace":
+        return self.of(lambda part: part[index])
+
+    def scaled(self, factor: float) -> "Trace":
+        """The same with all lengths × factor."""
+        lengths = {name: getattr(self, name) * factor for name in ("distance", "closest", "stopped")}
+        return self if factor == 1 else replace(self, **lengths)
+
+    def of(self, change: Callable[[Tensor], Tensor]) -> "Trace":
+        """The same with every image changed."""
+        return replace(self, **{name: change(part) for name, part in self.images().items()})
+
+    def images(self) -> dict[str, Tensor]:
+        """All that is known of each ray."""
+        parts = {part.name: getattr(self, part.name) for part in fields(self)}
+        return {name: part for name, part in parts.items() if isinstance(part, Tensor)}
 
 
 @torch.no_grad()
@@ -161,6 +174,7 @@ class _March:
         converged = value.abs() < tolerance
         inside = (t <= near) & (value < 0) & ~converged
         step = config.step_scale * value.clamp(-config.step_limit, config.step_limit)
+        step = torch.where(value > 0, step.clamp_min(config.least_step), step)
         following = self._bracketed(at, value, (t + step).maximum(near))
         escaped = (following > self.far[at]) & ~converged
         outcome = torch.full_like(self.outcome[at], -1)

@@ -22,7 +22,7 @@ from distrace.evaluate import (
 )
 from distrace.fit import FitConfig
 from distrace.page import figure, page, section, table
-from distrace.trace import STRATEGIES
+from distrace.render import STRATEGIES
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,9 @@ from distrace.cli.common import Flag, ModelName, opened, save_buffers, save_mesh
 from distrace.cli.console import console, start
 from distrace.field import Counted
 from distrace.mesh import MeshConfig, extract_mesh
+from distrace.render import STRATEGIES, Config
 from distrace.render import render as render_field
-from distrace.trace import STRATEGIES, Outcome
+from distrace.trace import Outcome, TraceConfig
 
 
 @dataclass(frozen=True)
@@ -29,8 +30,8 @@ class Render:
     focal_mm: float = 60.0
     sensor_mm: float = 32.0
     size: int = 512  # pixels along each side
-    strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine"] = "coarse_to_fine"
-    steps: int = 100
+    strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine", "fast"] = "fast"
+    steps: int | None = None  # at most, of every strategy but fast; as the strategy has it, if not given
     clearance: Flag = False  # also the least value of the field on each ray, which costs evaluations
     device: str = "cpu"
 
@@ -47,7 +48,7 @@ class Render:
         ).to(run.device)
         counted = Counted(opened(self.model, run.device).field(self.code))
         with torch.no_grad():
-            buffers = render_field(counted, camera, config=replace(STRATEGIES[self.strategy], steps=self.steps))
+            buffers = render_field(counted, camera, config=self._config())
             save_pictures(run.out, buffers, camera)
             save_buffers(run.out / "buffers.npz", buffers, self.clearance)
         outcomes = {outcome.name.lower(): int((buffers.trace.outcome == outcome).sum()) for outcome in Outcome}
@@ -61,6 +62,16 @@ class Render:
             "clearance_evaluations": counted.evaluations - buffers.trace.total_evaluations - outcomes["hit"],
         }
         run.finish({**facts, "strategy": self.strategy, "outcomes": outcomes})
+
+    def _config(self) -> Config:
+        config = STRATEGIES[self.strategy]
+        if self.steps is None:
+            return config
+        if not isinstance(config, TraceConfig):
+            raise ValueError(
+                f"--steps {self.steps} was given, and fast counts none; choose another --strategy, or no steps"
+            )
+        return replace(config, steps=self.steps)
 
 
 @dataclass(frozen=True)

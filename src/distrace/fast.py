@@ -1,0 +1,98 @@
+"""The fast tracer: a lattice foretells where rays meet the surface, neighbouring pixels sharpen it, one look tells.
+
+Images are traced from coarse to fine: the first pixels approach the surface step by step; a pixel between others that
+hit starts from their distances and slopes. Then outlines are followed: a pixel beside one that hits nearer looks there,
+too. What does not settle is marched.
+"""
+
+from dataclasses import dataclass, replace
+from itertools import product
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace import outlines, passes
+from distrace.camera import Camera
+from distrace.field import SDF, narrowed
+from distrace.lattice import Lattice, build
+from distrace.picture import FastConfig, Picture
+from distrace.rays import meet_sphere
+from distrace.trace import Trace, sphere_trace
+
+TILE = 1024  # pixels along each side of what is traced at once: a bound on memory
+
+
+@torch.no_grad()
+def fast_trace(
+    sdf: SDF,
+    camera: Camera,
+    radius: float = 1.0,
+    config: FastConfig = FastConfig(),
+    lattice: Lattice | None = None,
+    last: Trace | None = None,
+) -> tuple[Trace, Lattice]:
+    """Traces all pixels of a camera, or of a batch of them; the lattice can be given on to the next view of the field.
+
+    `last` is the trace of nearly the same field by nearly the same camera: guesses start from it.
+    """
+    unit = sdf if radius == 1 else _Unit(sdf, radius)
+    camera, last = camera.detach().scaled(1 / radius), last and last.scaled(1 / radius)
+    setup = 0
+    if lattice is None:
+        lattice = replace(build(unit, config.lattice, camera.intrinsics), radius=radius)
+        setup = lattice.evaluations
+    elif lattice.radius != radius:
+        raise ValueError(
+            f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out"
+        )
+    trace = _tiled(unit, camera, config, lattice, last).scaled(radius)
+    return replace(trace, setup_evaluations=setup), lattice
+
+
+@dataclass(frozen=True)
+class _Unit:
+    """A field scaled into the unit sphere. Equal where field and radius are."""
+
+    sdf: SDF
+    radius: float
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return self.sdf(points * self.radius) / self.radius
+
+    def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
+        values, field = narrowed(self.sdf, points * self.radius)
+        return values / self.radius, _Unit(field, self.radius)
+
+
+def _tiled(sdf: SDF, camera: Camera, config: FastConfig, lattice: Lattice, last: Trace | None) -> Trace:
+    height, width = camera.height, camera.width
+    if height <= TILE and width <= TILE:
+        return _traced(sdf, camera, config, lattice, last)
+    whole: Trace | None = None
+    for top, left in product(range(0, height, TILE), range(0, width, TILE)):
+        part = (..., slice(top, top + TILE), slice(left, left + TILE))
+        tile = _traced(sdf, camera.cropped(top, left, TILE, TILE), config, lattice, last and last[part])
+        whole = whole or tile.of(lambda image: image.new_empty(*image.shape[:-2], height, width))
+        for name, image in tile.images().items():
+            whole.images()[name][part] = image
+    assert whole is not None
+    return whole
+
+
+def _traced(sdf: SDF, camera: Camera, config: FastConfig, lattice: Lattice, last: Trace | None) -> Trace:
+    rays = camera.rays()
+    bounds = meet_sphere(rays)
+    if lattice.values.isnan().any():  # the field gives NaN somewhere: nothing can be foretold
+        trace = sphere_trace(sdf, rays, bounds, config.march)
+        return replace(trace, slope=torch.full_like(trace.distance, torch.nan))
+    spacing = 2 * camera.tolerance(1.0).expand(rays.shape)
+    picture = Picture(sdf, rays, bounds, spacing, lattice, config, last)
+    passes.trace_coarsest(picture)
+    for stride in config.strides[1:]:
+        passes.trace_between(picture, stride)
+    picture.march_left()
+    outlines.follow(picture)
+    picture.check_bends()
+    picture.march_left()
+    return picture.trace()
