@@ -13,6 +13,7 @@ import torch
 import trimesh
 from PIL import Image
 
+from distrace import charts, scene
 from distrace import page as html
 from distrace.camera import Camera
 from distrace.metrics import Chamfer
@@ -131,8 +132,8 @@ def test_markup_in_captions_cells_and_names_of_curves_and_clouds_stays_text() ->
     blocks = [
         html.figure(np.zeros((2, 2, 3), np.uint8), evil),
         html.table((evil,), [(evil,)]),
-        html.curves({evil: [1.0, 2.0]}, evil, evil, log=False, emphasised=evil),
-        html.scene({evil: mesh}, {evil: np.zeros((1, 3))}),
+        charts.curves({evil: [1.0, 2.0]}, evil, evil, log=False, emphasised=evil),
+        scene.scene({evil: mesh}, {evil: np.zeros((1, 3))}),
         html.key({evil: (0, 0, 0)}),
         html.paragraph(evil),
         html.section(evil),
@@ -179,9 +180,9 @@ def test_the_curves_have_their_names_and_the_chosen_start_is_told(read: Reader) 
 
 
 def test_the_axes_of_curves_take_the_colour_of_the_page() -> None:
-    drawn = html.curves({"a": [1.0, 2.0]}, "step", "loss", log=True)
+    drawn = charts.curves({"a": [1.0, 2.0]}, "step", "loss", log=True)
     assert "currentColor" in drawn
-    assert html.THEME_INK not in drawn
+    assert charts.THEME_INK not in drawn
 
 
 def test_the_scene_holds_the_surface_the_observed_points_and_the_truth(read: Reader, completion: Completion) -> None:
@@ -215,12 +216,12 @@ def test_a_dense_observation_is_shown_as_depth_and_a_sparse_one_as_dots(completi
 
 def test_a_mesh_of_many_faces_is_thinned_but_keeps_its_form() -> None:
     fine = trimesh.creation.icosphere(subdivisions=6, radius=0.7)
-    assert len(fine.faces) > html.MOST_FACES
-    surface = Reader(html.scene({"fine": fine}, {}))
+    assert len(fine.faces) > scene.MOST_FACES
+    surface = Reader(scene.scene({"fine": fine}, {}))
     drawn = json.loads(surface.scripts[0])["data"][0]
     i = np.frombuffer(base64.b64decode(drawn["i"]["bdata"]), drawn["i"]["dtype"])
     corners = np.stack([np.frombuffer(base64.b64decode(drawn[axis]["bdata"]), np.float32) for axis in "xyz"], axis=1)
-    assert 10_000 < len(i) <= html.MOST_FACES
+    assert 10_000 < len(i) <= scene.MOST_FACES
     assert np.abs(np.linalg.norm(corners, axis=1) - 0.7).max() < 0.01
 
 

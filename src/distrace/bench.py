@@ -1,7 +1,7 @@
-"""Measuring the strategies of tracing on one view, against a reference that takes no chances."""
+"""Measuring ways to trace a view, against a reference that takes no chances."""
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from statistics import median
 
@@ -13,7 +13,7 @@ from distrace.camera import Camera
 from distrace.field import SDF
 from distrace.metrics import depth_errors, iou
 from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.render import Buffers, Config, render
+from distrace.render import Buffers
 
 OUTLIER = 1e-3
 LONG = 60.0  # seconds; what takes longer is run once
@@ -22,11 +22,15 @@ SMALLEST_STEP = 5e-5
 
 @dataclass(frozen=True)
 class Row:
-    """One strategy: what it cost and how far it is off. `setup_queries` are among the `queries`."""
+    """One strategy: what it cost and how far it is off. `setup_queries` are among the `queries`.
+
+    Where only a sample of the rays was traced (`share` below 1), counts and times are extrapolated from it.
+    """
 
     strategy: str
     queries: int
     setup_queries: int
+    per_pixel: float  # queries per visible pixel of the reference
     seconds: float
     runs: int
     hits: int
@@ -35,9 +39,20 @@ class Row:
     depth_p99: float
     depth_max: float
     outliers: int
+    share: float = 1.0
 
     def asdict(self) -> dict:
         return asdict(self)
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a row is measured on: a way to render some rays, and the depth that they should show."""
+
+    strategy: str
+    render: Callable[[], Buffers]
+    truth: Float[Tensor, "*batch"]
+    share: float = 1.0  # of all rays that enter the sphere
 
 
 def poster_view(size: int = 512) -> Camera:
@@ -80,45 +95,57 @@ def _bisected(sdf: SDF, rays: Rays, inside: Tensor) -> Tensor:
     return inside.index_put((found,), (low + high) / 2)
 
 
-def ablation(
-    sdf: SDF, camera: Camera, strategies: Mapping[str, Config], radius: float = 1.0, repeats: int = 5
-) -> Iterator[tuple[Row, Buffers]]:
-    """Measures each strategy on one view: times are medians of some runs after one to warm up."""
+def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tensor, "height width"]:
     rays = camera.rays()
-    truth = camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius)))
-    for name, config in strategies.items():
-        buffers, seconds, runs = _timed(sdf, camera, radius, config, repeats)
-        yield measured(name, buffers, truth, seconds, runs), buffers
+    return camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius)))
 
 
-def measured(name: str, buffers: Buffers, truth: Float[Tensor, "height width"], seconds: float, runs: int) -> Row:
-    trace, errors = buffers.trace, depth_errors(buffers.depth, truth)
-    if not len(errors):
-        raise ValueError("the view shows nothing of this shape; there is nothing to measure")
-    return Row(
-        strategy=name,
-        queries=trace.total_evaluations,
-        setup_queries=trace.setup_evaluations,
-        seconds=seconds,
-        runs=runs,
-        hits=int(buffers.mask.sum()),
-        iou=iou(buffers.mask, torch.isfinite(truth)),
-        depth_mean=float(errors.mean()),
-        depth_p99=float(errors.quantile(0.99)) if len(errors) < 1 << 24 else float("nan"),
-        depth_max=float(errors.max()),
-        outliers=int((errors > OUTLIER).sum()),
-    )
+def measure(cases: Iterable[Case], repeats: int, said: Callable[[str], None] = str) -> list[tuple[Row, Buffers]]:
+    """Runs all cases in turn, once to warm up and then `repeats` times; a row's time is its median.
+
+    A case that takes over a minute runs once. `said` is told what was done.
+    """
+    cases, seconds, shown = list(cases), {}, {}
+    for turn in range(repeats + 1 if repeats > 1 else 1):
+        for case in cases:
+            times = seconds.setdefault(case.strategy, [])
+            if turn and times[0] > LONG:
+                continue
+            shown[case.strategy], taken = _timed(case)
+            times.append(taken)
+            said(f"{case.strategy}: {taken:.1f} s")
+    timed = {name: times[1:] or times for name, times in seconds.items()}
+    return [
+        (_row(case, shown[case.strategy], median(timed[case.strategy]), len(timed[case.strategy])), shown[case.strategy])
+        for case in cases
+    ]
 
 
 @torch.no_grad()
-def _timed(sdf: SDF, camera: Camera, radius: float, config: Config, repeats: int) -> tuple[Buffers, float, int]:
-    """The last rendering, the median time, and of how many runs; a single run is not warmed up for."""
-    seconds: list[float] = []
-    while len(seconds) < (repeats + 1 if repeats > 1 else 1) and not (seconds and seconds[0] > LONG):
-        began = time.perf_counter()
-        buffers = render(sdf, camera, radius=radius, config=config)
-        if buffers.trace.distance.is_cuda:
-            torch.cuda.synchronize()
-        seconds.append(time.perf_counter() - began)
-    timed = seconds[1:] or seconds
-    return buffers, median(timed), len(timed)
+def _timed(case: Case) -> tuple[Buffers, float]:
+    began = time.perf_counter()
+    buffers = case.render()
+    if buffers.trace.distance.is_cuda:
+        torch.cuda.synchronize()
+    return buffers, time.perf_counter() - began
+
+
+def _row(case: Case, buffers: Buffers, seconds: float, runs: int) -> Row:
+    trace, errors = buffers.trace, depth_errors(buffers.depth, case.truth)
+    if not len(errors):
+        raise ValueError("the view shows nothing of this shape; there is nothing to measure")
+    return Row(
+        strategy=case.strategy,
+        queries=round(trace.total_evaluations / case.share),
+        setup_queries=trace.setup_evaluations,
+        per_pixel=trace.total_evaluations / max(int(torch.isfinite(case.truth).sum()), 1),
+        seconds=seconds / case.share,
+        runs=runs,
+        hits=round(int(buffers.mask.sum()) / case.share),
+        iou=iou(buffers.mask, torch.isfinite(case.truth)),
+        depth_mean=float(errors.mean()),
+        depth_p99=float(errors.quantile(0.99)) if len(errors) < 1 << 24 else float("nan"),
+        depth_max=float(errors.max()),
+        outliers=round(int((errors > OUTLIER).sum()) / case.share),
+        share=case.share,
+    )

@@ -36,33 +36,45 @@ def fast_trace(
 
     `last` is the trace of nearly the same field by nearly the same camera: guesses start from it.
     """
-    unit = sdf if radius == 1 else _Unit(sdf, radius)
-    camera, last = camera.detach().scaled(1 / radius), last and last.scaled(1 / radius)
     setup = 0
     if lattice is None:
-        lattice = replace(build(unit, config.lattice, camera.intrinsics), radius=radius)
-        setup = lattice.evaluations
+        lattice, setup = _prepared(sdf, camera.intrinsics.detach(), radius, config)
     elif lattice.radius != radius:
-        raise ValueError(
-            f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out"
-        )
-    trace = _tiled(unit, camera, config, lattice, last).scaled(radius)
-    return replace(trace, setup_evaluations=setup), lattice
+        raise ValueError(f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out")
+    unit, steepness = _unit(sdf, radius, lattice.steepness), lattice.steepness
+    last = last and last.scaled(1 / radius, 1 / steepness)
+    trace = _tiled(unit, camera.detach().scaled(1 / radius), config, lattice, last)
+    return replace(trace.scaled(radius, steepness), setup_evaluations=setup), lattice
+
+
+def _prepared(sdf: SDF, like: Tensor, radius: float, config: FastConfig) -> tuple[Lattice, int]:
+    """A lattice of the field; where that turns out to be too steep, another one of the field divided by its steepness."""
+    lattice = build(_unit(sdf, radius, 1.0), config.lattice, like)
+    evaluations, steepness = lattice.evaluations, lattice.measured_steepness()
+    if steepness > config.lattice.steepest:
+        lattice = build(_unit(sdf, radius, steepness), config.lattice, like)
+        lattice, evaluations = replace(lattice, steepness=steepness), evaluations + lattice.evaluations
+    return replace(lattice, radius=radius), evaluations
+
+
+def _unit(sdf: SDF, radius: float, steepness: float) -> SDF:
+    return sdf if radius == 1 and steepness == 1 else _Unit(sdf, radius, steepness)
 
 
 @dataclass(frozen=True)
 class _Unit:
-    """A field scaled into the unit sphere. Equal where field and radius are."""
+    """A field scaled into the unit sphere, and to a slope of 1."""
 
     sdf: SDF
     radius: float
+    steepness: float
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        return self.sdf(points * self.radius) / self.radius
+        return self.sdf(points * self.radius) / (self.radius * self.steepness)
 
     def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
         values, field = narrowed(self.sdf, points * self.radius)
-        return values / self.radius, _Unit(field, self.radius)
+        return values / (self.radius * self.steepness), _Unit(field, self.radius, self.steepness)
 
 
 def _tiled(sdf: SDF, camera: Camera, config: FastConfig, lattice: Lattice, last: Trace | None) -> Trace:

@@ -113,15 +113,18 @@ class _Examined:
                 break
             at = self.open
             self.before[at] = self.t[at] - self.width[at]
-            enclosed = self._downhill(at)
+            enclosed, bound = self._downhill(at)
             self.width[at] /= torch.where(enclosed, 4, 1)
             self.ahead[at] = torch.nan
-            value = self.value[at]
-            self.open = at[(value > 0) & (value < torch.where(enclosed, NEARLY, 2 * self.step[at]))]
+            near = self.value[at] < torch.where(enclosed, NEARLY, 2 * self.step[at])
+            self.open = at[(self.value[at] > 0) & (near | (bound < 0))]
         return self
 
-    def _downhill(self, at: Tensor) -> Tensor:
-        """The least of samples to both sides and, if worth it, of their parabola's vertex; whether that is enclosed."""
+    def _downhill(self, at: Tensor) -> tuple[Tensor, Tensor]:
+        """Moves to the least of samples to both sides and, if worth it, of their parabola's vertex.
+
+        Whether that is enclosed, and how low f may be between the samples at a kink, by the steeper of their slopes.
+        """
         pixels, t, value, width = self.pixels[at], self.t[at], self.value[at], self.width[at]
         left, right = self.picture.look(pixels, t - width), self.ahead[at]
         unknown = right.isnan()
@@ -135,7 +138,8 @@ class _Examined:
         self.outer[at] = left
         self.value[at], best = torch.stack([value, left, right, lowest]).min(0)
         self.t[at] = torch.stack([t, t - width, t + width, vertex]).gather(0, best[None])[0]
-        return (best == 0) | ((best == 3) & (offset.abs() <= width))
+        steepest = (torch.maximum(left, right) - value).clamp_min(0)  # times the width
+        return (best == 0) | ((best == 3) & (offset.abs() <= width)), (left + right) / 2 - steepest
 
     def enter(self) -> None:
         """Settles the surface between samples in the solid and those before them."""

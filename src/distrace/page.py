@@ -1,22 +1,17 @@
-"""Pages of one HTML file: pictures, tables, curves and 3-D views, with all that they need inside.
+"""Pages of one HTML file: pictures and tables, with all that they need inside; charts and 3-D views are apart.
 
 Functions take plain text and escape it; what they return, `Html`, goes into others as it is.
 """
 
 import base64
 import io
-import math
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import Any, NewType
+from typing import NewType
 
 import numpy as np
-import plotly.graph_objects as go
-import trimesh
-from jaxtyping import Float, Int, UInt8
-from matplotlib import rc_context
-from matplotlib.figure import Figure
+from jaxtyping import UInt8
 from PIL import Image
 from plotly.offline import get_plotlyjs
 
@@ -24,14 +19,7 @@ from distrace.shading import Colour, Picture
 
 Html = NewType("Html", str)
 
-MOST_FACES = 60_000
-MOST_POINTS = 8_000
-PALETTE = ("#4477aa", "#ee7733", "#228833", "#cc3377", "#8866cc", "#0099aa", "#aa8811", "#888888")
-THEME_INK = "#010203"  # stands in a chart for the colour of the page's text
 NUMBER = re.compile(r"–?|[-+−]?[\d.,]+(e[-+]?\d+)?\s?%?")  # or none
-CHART: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "distrace", "font.size": 10.5} | dict.fromkeys(
-    ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), THEME_INK
-)
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2128; --soft: #616b78; --paper: #fbfbfa; --card: #fff; --line: #e3e5e8; }
@@ -156,96 +144,6 @@ def ramp(first: str, last: str, colours: UInt8[np.ndarray, "1 n 3"]) -> Html:
     )
 
 
-def curves(
-    series: Mapping[str, Sequence[float]], x_label: str, y_label: str, log: bool, emphasised: str | None = None
-) -> Html:
-    """Curves over the steps 1, 2, …, in the colours of the page; the others step back from an emphasised one."""
-    drawn = io.StringIO()
-    with rc_context(CHART):
-        chart = _chart(series, emphasised)
-        chart.axes[0].set(xlabel=x_label, ylabel=y_label, yscale="log" if log else "linear")
-        chart.savefig(drawn, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))
-    svg = drawn.getvalue().partition("<svg ")[2].replace(THEME_INK, "currentColor")
-    return Html('<div class="chart"><svg ' + re.sub(r'<g id="[^"]*">', "<g>", svg) + "</div>")
-
-
-def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
-    """A view to turn, y up. Each name stands in the legend, which hides and shows it."""
-    surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
-    points = [
-        _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
-    ]
-    hidden = dict(visible=False)
-    camera = dict(eye=dict(x=1.4, y=0.8, z=0.6))
-    layout = go.Layout(
-        template="none",
-        margin=dict(l=0, r=0, t=0, b=0),
-        paper_bgcolor="rgba(0,0,0,0)",
-        modebar=dict(bgcolor="rgba(0,0,0,0)", color="#98a2af", activecolor="#4477aa"),
-        legend=dict(x=0.015, y=0.985, itemsizing="constant", bgcolor="rgba(0,0,0,0)"),
-        scene=dict(xaxis=hidden, yaxis=hidden, zaxis=hidden, aspectmode="data", camera=camera, dragmode="turntable"),
-    )
-    content = str(go.Figure([*surfaces, *points], layout).to_json()).replace("<", "\\u003c")
-    return Html(f'<script type="application/json">{content}</script><div class="scene"></div>')
-
-
 def _line(tag: str, cells: Sequence[str], numeric: Sequence[bool]) -> str:
     kinds = (' class="number"' if right else "" for right in numeric)
     return "<tr>" + "".join(f"<{tag}{kind}>{escape(cell)}</{tag}>" for cell, kind in zip(cells, kinds)) + "</tr>"
-
-
-def _chart(series: Mapping[str, Sequence[float]], emphasised: str | None) -> Figure:
-    chart = Figure(figsize=(7.4, 3.6), layout="constrained", facecolor="none")
-    axes = chart.add_subplot(facecolor="none")
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.grid(axis="y", color=THEME_INK, alpha=0.12, linewidth=0.6)
-    for i, (name, values) in enumerate(series.items()):
-        leads = emphasised in (None, name)
-        (line,) = axes.plot(range(1, len(values) + 1), values, label=name.replace("$", r"\$"))
-        line.set(color=PALETTE[i % len(PALETTE)], linewidth=1.8 if leads else 1.2, alpha=1.0 if leads else 0.7)
-        line.set_zorder(3 if leads else 2)
-    if series:
-        axes.legend(frameon=False)
-    return chart
-
-
-def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
-    vertices, faces = _decimated(np.asarray(mesh.vertices), np.asarray(mesh.faces))
-    light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
-    return go.Mesh3d(
-        **_coordinates(vertices),
-        **dict(zip("ijk", faces.astype(np.int32).T)),
-        name=escape(name),
-        color="#cfc3b5",
-        lighting=light,
-        lightposition=dict(x=3, y=-2, z=6),
-        showlegend=True,
-        hoverinfo="skip",
-    )
-
-
-def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
-    some = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
-    dot = dict(size=1.8 if len(some) > 1000 else 4, color=colour)
-    return go.Scatter3d(**_coordinates(some), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")
-
-
-def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
-    """World z, x, y as plotly's x, y, z: its turntable turns around its z alone."""
-    return dict(zip("xyz", points[:, [2, 0, 1]].astype(np.float32).T))
-
-
-def _decimated(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
-) -> tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]:
-    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993)."""
-    width = np.ptp(vertices, axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
-    corners, triangles = vertices, faces
-    while len(triangles) > MOST_FACES:
-        _, cell = np.unique(np.floor(vertices / width).astype(int), axis=0, return_inverse=True)
-        cell = cell.reshape(-1)
-        corners = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / np.bincount(cell)[:, None]
-        triangles = cell[faces]
-        triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(1)]
-        width *= 1.1
-    return corners, triangles

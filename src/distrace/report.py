@@ -9,7 +9,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from distrace import shading
 from distrace.metrics import POINTS, Chamfer, iou
-from distrace.page import Html, curves, figure, key, page, paragraph, ramp, row, scene, section, table
+from distrace.charts import curves
+from distrace.page import Html, figure, key, page, paragraph, ramp, row, section, table
+from distrace.scene import scene
 from distrace.render import Buffers
 from distrace.shading import Picture
 

@@ -73,10 +73,10 @@ class Trace:
     def __getitem__(self, index: Tensor | tuple) -> "Trace":
         return self.of(lambda part: part[index])
 
-    def scaled(self, factor: float) -> "Trace":
-        """The same with all lengths × factor."""
-        lengths = {name: getattr(self, name) * factor for name in ("distance", "closest", "stopped")}
-        return self if factor == 1 else replace(self, **lengths)
+    def scaled(self, length: float, slope: float = 1.0) -> "Trace":
+        """The same in a world whose lengths are × `length`, of a field whose slopes are × `slope`."""
+        changed = {name: getattr(self, name) * length for name in ("distance", "closest", "stopped")}
+        return replace(self, **changed, slope=None if self.slope is None else self.slope * slope)
 
     def of(self, change: Callable[[Tensor], Tensor]) -> "Trace":
         """The same with every image changed."""

@@ -1,20 +1,42 @@
 """`render` and `mesh`: looking at a model."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
 import tyro
 
 from distrace.camera import Camera
 from distrace.cli.common import Flag, ModelName, opened, save_buffers, save_mesh, save_pictures
-from distrace.cli.console import console, start
+from distrace.cli.console import console, progress, start
 from distrace.field import Counted
 from distrace.mesh import MeshConfig, extract_mesh
-from distrace.render import STRATEGIES, Config
-from distrace.render import render as render_field
-from distrace.trace import Outcome, TraceConfig
+from distrace.movie import filmed, save_gif, save_mp4, turntable
+from distrace.render import STRATEGIES, Buffers, Config
+from distrace.report import View
+from distrace.trace import Outcome, Trace, TraceConfig
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What one image took, and what became of its rays."""
+
+    evaluations: int
+    setup_evaluations: int
+    outcomes: dict[str, int]
+
+    @staticmethod
+    def of(trace: Trace) -> "Tally":
+        outcomes = {outcome.name.lower(): int((trace.outcome == outcome).sum()) for outcome in Outcome}
+        return Tally(trace.total_evaluations, trace.setup_evaluations, outcomes)
+
+    @property
+    def per_visible_pixel(self) -> float | None:
+        """Evaluations; None where nothing is seen."""
+        return self.evaluations / self.outcomes["hit"] if self.outcomes["hit"] else None
 
 
 @dataclass(frozen=True)
@@ -24,6 +46,7 @@ class Render:
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/render")
     code: int = 0  # which training shape
+    orbit: int | None = None  # also a movie, as MP4 and GIF: so many frames, once around the vertical axis
     azimuth: float = 30.0  # degrees
     elevation: float = 20.0  # degrees
     distance: float = 4.97  # of the camera from the origin
@@ -37,7 +60,19 @@ class Render:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        camera = Camera.orbit(
+        camera = self._camera().to(run.device)
+        cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
+        counted = Counted(opened(self.model, run.device).field(self.code))
+        with torch.no_grad():
+            views = self._saving_first(filmed(counted, cameras, config=self._config()), camera)
+            tallies = self._tallies(views) if self.orbit is None else self._turning(views, self.orbit)
+        facts = _facts(tallies, counted.evaluations)
+        across = f"{self.size * self.size * len(tallies)} pixels"
+        console.print(f"{facts['outcomes']['hit']} of {across} hit, {facts['evaluations']} evaluations")
+        run.finish({**facts, "strategy": self.strategy, **({} if self.orbit is None else _each(tallies))})
+
+    def _camera(self) -> Camera:
+        return Camera.orbit(
             self.azimuth,
             self.elevation,
             self.distance,
@@ -45,23 +80,15 @@ class Render:
             sensor_mm=self.sensor_mm,
             height=self.size,
             width=self.size,
-        ).to(run.device)
-        counted = Counted(opened(self.model, run.device).field(self.code))
-        with torch.no_grad():
-            buffers = render_field(counted, camera, config=self._config())
-            save_pictures(run.out, buffers, camera)
-            save_buffers(run.out / "buffers.npz", buffers, self.clearance)
-        outcomes = {outcome.name.lower(): int((buffers.trace.outcome == outcome).sum()) for outcome in Outcome}
-        console.print(
-            f"{outcomes['hit']} of {self.size * self.size} pixels hit, {buffers.trace.total_evaluations} evaluations"
         )
-        facts = {
-            "evaluations": buffers.trace.total_evaluations,
-            "setup_evaluations": buffers.trace.setup_evaluations,
-            "gradient_evaluations": outcomes["hit"],  # the normals
-            "clearance_evaluations": counted.evaluations - buffers.trace.total_evaluations - outcomes["hit"],
-        }
-        run.finish({**facts, "strategy": self.strategy, "outcomes": outcomes})
+
+    def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
+        """The same views; the first leaves its pictures and its arrays."""
+        first = next(views)
+        save_pictures(self.out, first, camera)
+        save_buffers(self.out / "buffers.npz", first, self.clearance)
+        yield first
+        yield from views
 
     def _config(self) -> Config:
         config = STRATEGIES[self.strategy]

@@ -1,15 +1,13 @@
-"""`bench` and `evaluate`: tables of results, as JSON, as pictures and in the terminal."""
+"""`evaluate`: tables of results, as JSON, as pictures and in the terminal."""
 
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import tyro
-from rich.table import Table
 
 from distrace import shading
-from distrace.bench import Row, ablation, poster_view
-from distrace.cli.common import ModelName, opened
+from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, save_json, start
 from distrace.data.split import read_split
 from distrace.evaluate import (
@@ -22,36 +20,6 @@ from distrace.evaluate import (
 )
 from distrace.fit import FitConfig
 from distrace.page import figure, page, section, table
-from distrace.render import STRATEGIES
-
-
-@dataclass(frozen=True)
-class Bench:
-    """Measure what each strategy costs and how far it is off, against a reference that takes no chances."""
-
-    what: tyro.conf.Positional[Literal["trace"]]  # trace: the strategies of tracing on the poster's view
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
-    out: Path = Path("out/bench")
-    code: int = 0  # which training shape
-    size: int = 512
-    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
-    device: str = "cpu"
-
-    def run(self) -> None:
-        run = start(self.out, self.device)
-        field = opened(self.model, run.device).field(self.code)
-        rows: list[Row] = []
-        images = []
-        with progress(self.what, len(STRATEGIES)) as bar:
-            camera = poster_view(self.size).to(run.device)
-            for row, buffers in ablation(field, camera, STRATEGIES, repeats=self.repeats):
-                rows.append(row)
-                images.append(shading.error_picture(buffers.trace.evaluations.float(), 50.0))
-                bar.advance(f"{row.strategy}: {row.queries} queries")
-        shading.save_png(run.out / "evaluations.png", shading.side_by_side(images))
-        recorded = [{"model": self.model, **row.asdict()} for row in rows]
-        _show(recorded)
-        run.finish({"rows": recorded, **origin(), "evaluations": sum(row.queries for row in rows)})
 
 
 @dataclass(frozen=True)
@@ -92,7 +60,7 @@ def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
         raise ValueError(f"{model} and the split have no shape in common that {name} is about; give a --split that has")
     rows = [result.row(model) for result in results]
     totals = summary(results)
-    _show(rows)
+    show_table(rows)
     for method, values in totals.items():
         console.print(f"{method}: " + ", ".join(f"{word} {value:.3f}" for word, value in values.items()))
     sheet = picture_of(results)
@@ -105,19 +73,3 @@ def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
     ]
     (run.out / "index.html").write_text(page(f"{name}: {model}", lead, parts))
     run.finish({"rows": rows, "summary": totals, **origin()})
-
-
-def _show(rows: list[dict]) -> None:
-    shown = Table(*rows[0])
-    for row in rows:
-        shown.add_row(
-            *(
-                f"{value:.2e}"
-                if isinstance(value, float) and 0 < value < 0.01
-                else f"{value:g}"
-                if isinstance(value, float)
-                else str(value)
-                for value in row.values()
-            )
-        )
-    console.print(shown)

@@ -1,0 +1,104 @@
+"""Movies: one field as many cameras see it, and pictures in a row as MP4 and as GIF."""
+
+import math
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+from av.video.reformatter import ColorRange, Colorspace
+from jaxtyping import UInt8
+from PIL import Image
+
+from distrace.camera import Camera
+from distrace.field import SDF
+from distrace.files import written
+from distrace.picture import FastConfig
+from distrace.render import Buffers, Config, render
+from distrace.shading import Picture
+
+Pictures = UInt8[np.ndarray, "frames height width 3"]
+
+FRAME = Fraction(8, 100)  # seconds, unless told; a GIF counts in hundredths
+BT709 = 1  # H.264's number for the colours, the curve and the matrix of HD television
+
+
+def turntable(camera: Camera, frames: int) -> list[Camera]:
+    """Cameras in even steps around the world's vertical axis, anticlockwise from above, from the given one on.
+
+    Raises `ValueError` for less than two frames.
+    """
+    if frames < 2:
+        raise ValueError(f"an orbit of {frames} frames was asked for; a turn takes at least 2")
+    return [_turned(camera, 2 * math.pi * frame / frames) for frame in range(frames)]
+
+
+def filmed(
+    sdf: SDF, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = FastConfig()
+) -> Iterator[Buffers]:
+    """Renders a field as each camera sees it. What the first image of the fast tracer learns of the field, all use.
+
+    Raises `ValueError` for a radius that is not positive.
+    """
+    lattice = None
+    for camera in cameras:
+        buffers = render(sdf, camera, radius=radius, config=config, lattice=lattice)
+        lattice = buffers.lattice
+        yield buffers
+
+
+def save_mp4(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
+    """Writes [frames, height, width, 3] as H.264 that browsers play, each picture for `frame` seconds.
+
+    Its sides are even: odd ones get a white row below, a white column on the right. Raises `ValueError` for no picture.
+    """
+    even = _even(_some(pictures))
+    with written(path) as file:  # by its name: to bring the index to the front, the file is read again
+        with av.open(file.name, "w", format="mp4", options={"movflags": "faststart"}) as movie:
+            stream = movie.add_stream("libx264", rate=1 / frame, options={"crf": "18"})
+            stream.height, stream.width = even.shape[1:3]
+            stream.pix_fmt, stream.color_range = "yuv420p", ColorRange.MPEG
+            stream.colorspace = stream.color_primaries = stream.color_trc = BT709
+            for picture in even:
+                movie.mux(stream.encode(_encodable(picture)))
+            movie.mux(stream.encode())
+
+
+def save_gif(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
+    """Writes [frames, height, width, 3] in 256 colours chosen for all of them together; plays for ever.
+
+    Pictures that equal the one before become one with it, shown for longer. Raises `ValueError` for no picture.
+    """
+    _, _, width, _ = _some(pictures).shape
+    palette = Image.fromarray(pictures.reshape(-1, width, 3)).quantize()
+    first, *others = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    with written(path) as file:
+        milliseconds = round(1000 * frame)
+        first.save(file, format="GIF", save_all=True, append_images=others, duration=milliseconds, loop=0)
+
+
+def _turned(camera: Camera, angle: float) -> Camera:
+    """The camera carried around the y axis by an angle in radians."""
+    cosine, sine = math.cos(angle), math.sin(angle)
+    rows = [[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]]
+    return replace(camera, T_world_camera=camera.T_world_camera.new_tensor(rows) @ camera.T_world_camera)
+
+
+def _some(pictures: Pictures) -> Pictures:
+    if not len(pictures):
+        raise ValueError("no picture was given; a movie needs at least one")
+    return pictures
+
+
+def _even(pictures: Pictures) -> Pictures:
+    """H.264 halves the resolution of colours."""
+    _, height, width, _ = pictures.shape
+    return np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
+
+
+def _encodable(picture: Picture) -> av.VideoFrame:
+    """In the colours that the stream says it has: who plays it would guess otherwise."""
+    frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
+    return frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)

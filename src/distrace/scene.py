@@ -1,0 +1,78 @@
+"""3-D views in a page, to turn with the mouse."""
+
+import math
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+import plotly.graph_objects as go
+import trimesh
+from jaxtyping import Float, Int
+
+from distrace.charts import PALETTE
+from distrace.page import Html
+
+MOST_FACES = 60_000
+MOST_POINTS = 8_000
+
+
+def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
+    """A view to turn, y up. Each name stands in the legend, which hides and shows it."""
+    surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
+    points = [
+        _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
+    ]
+    hidden = dict(visible=False)
+    camera = dict(eye=dict(x=1.4, y=0.8, z=0.6))
+    layout = go.Layout(
+        template="none",
+        margin=dict(l=0, r=0, t=0, b=0),
+        paper_bgcolor="rgba(0,0,0,0)",
+        modebar=dict(bgcolor="rgba(0,0,0,0)", color="#98a2af", activecolor="#4477aa"),
+        legend=dict(x=0.015, y=0.985, itemsizing="constant", bgcolor="rgba(0,0,0,0)"),
+        scene=dict(xaxis=hidden, yaxis=hidden, zaxis=hidden, aspectmode="data", camera=camera, dragmode="turntable"),
+    )
+    content = str(go.Figure([*surfaces, *points], layout).to_json()).replace("<", "\\u003c")
+    return Html(f'<script type="application/json">{content}</script><div class="scene"></div>')
+
+
+def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
+    vertices, faces = _decimated(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
+    return go.Mesh3d(
+        **_coordinates(vertices),
+        **dict(zip("ijk", faces.astype(np.int32).T)),
+        name=escape(name),
+        color="#cfc3b5",
+        lighting=light,
+        lightposition=dict(x=3, y=-2, z=6),
+        showlegend=True,
+        hoverinfo="skip",
+    )
+
+
+def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
+    some = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
+    dot = dict(size=1.8 if len(some) > 1000 else 4, color=colour)
+    return go.Scatter3d(**_coordinates(some), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")
+
+
+def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+    """World z, x, y as plotly's x, y, z: its turntable turns around its z alone."""
+    return dict(zip("xyz", points[:, [2, 0, 1]].astype(np.float32).T))
+
+
+def _decimated(
+    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]:
+    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993)."""
+    width = np.ptp(vertices, axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
+    corners, triangles = vertices, faces
+    while len(triangles) > MOST_FACES:
+        _, cell = np.unique(np.floor(vertices / width).astype(int), axis=0, return_inverse=True)
+        cell = cell.reshape(-1)
+        corners = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / np.bincount(cell)[:, None]
+        triangles = cell[faces]
+        triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(1)]
+        width *= 1.1
+    return corners, triangles
