@@ -4,16 +4,20 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
-from distrace.bench import LONG, Row, ablation, measured, poster_view, reference_distance
+from distrace.ablation import COUNT, NAIVE_RAYS, of_field, of_model
+from distrace.bench import LONG, Case, Row, in_turn, measure, poster_view, reference_distance
 from distrace.camera import Camera
-from distrace.field import Counted
+from distrace.checkpoint import Model
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.field import SDF, Counted
 from distrace.primitives import box, capsule, sphere, union
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import STRATEGIES, Buffers, render
 
 COLUMNS = ["strategy", "queries", "setup_queries", "seconds", "hits", "iou", "depth_mean", "depth_p99", "depth_max"]
-COLUMNS += ["outliers", "runs"]
+COLUMNS += ["outliers", "runs", "per_pixel", "share"]
 PUBLISHED = ("parallel", "dynamic", "aggressive", "coarse_to_fine")
 SOFA = union(
     box(torch.tensor([0.7, 0.12, 0.3])),
@@ -64,60 +68,96 @@ def test_the_reference_ends_on_a_ray_along_which_the_field_only_comes_close_to_z
 
 
 @pytest.fixture(scope="module")
-def table() -> list[tuple[Row, Buffers]]:
-    return list(ablation(SOFA, poster_view(64), STRATEGIES))
+def table() -> dict[str, tuple[Row, Buffers]]:
+    return {row.strategy: (row, buffers) for row, buffers in measure(of_field(SOFA, poster_view(64)), repeats=1)}
 
 
-def test_a_row_has_the_keys_of_the_contract(table: list[tuple[Row, Buffers]]) -> None:
-    for row, _ in table:
+def test_a_row_has_the_keys_of_the_contract(table: dict[str, tuple[Row, Buffers]]) -> None:
+    for row, _ in table.values():
         assert set(row.asdict()) == set(COLUMNS)
-    assert [row.strategy for row, _ in table] == list(STRATEGIES)
-    assert all(type(value) in (str, int, float) for row, _ in table for value in row.asdict().values())
+    assert list(table) == ["naive", *STRATEGIES]
+    assert all(type(value) in (str, int, float) for row, _ in table.values() for value in row.asdict().values())
 
 
-def test_every_strategy_shows_what_the_reference_shows(table: list[tuple[Row, Buffers]]) -> None:
-    for row, buffers in table:
-        assert row.iou > 0.99, row.strategy
-        assert row.depth_mean < 1e-4, row.strategy
+def test_every_strategy_shows_what_the_reference_shows(table: dict[str, tuple[Row, Buffers]]) -> None:
+    for name in STRATEGIES:
+        row, buffers = table[name]
+        assert row.iou > 0.99, name
+        assert row.depth_mean < 1e-4, name
         assert row.depth_mean <= row.depth_p99 <= row.depth_max
         assert row.hits == int(buffers.mask.sum()) > 500
         assert row.outliers <= 0.01 * row.hits
 
 
-def test_queries_fall_in_the_published_order(table: list[tuple[Row, Buffers]]) -> None:
-    queries = {row.strategy: row.queries for row, _ in table}
-    order = [queries[name] for name in PUBLISHED]
+def test_queries_fall_in_the_published_order(table: dict[str, tuple[Row, Buffers]]) -> None:
+    order = [table[name][0].queries for name in PUBLISHED]
     assert order == sorted(order, reverse=True)
     assert len(set(order)) == len(order)
     entering = int(meet_sphere(poster_view(64).rays()).meets.sum())
-    assert queries["parallel"] == 50 * entering, "every ray at every step"
+    assert order[0] == 50 * entering, "every ray at every step"
     assert order[-1] < order[0] / 5
-    assert queries["fast"] < order[-1] / 1.5, "of 64 pixels a side: more than half of it is for the lattice"
+    assert table["fast"][0].queries < order[-1] / 1.5, "of 64 pixels a side: more than half of it is for the lattice"
+
+
+def test_naive_is_a_sample_of_rays_each_for_all_of_its_steps(table: dict[str, tuple[Row, Buffers]]) -> None:
+    row, buffers = table["naive"]
+    entering = int(meet_sphere(poster_view(64).rays()).meets.sum())
+    assert (buffers.trace.evaluations == 50).all()
+    assert buffers.trace.distance.shape == (NAIVE_RAYS,)
+    assert row.share == NAIVE_RAYS / entering
+    assert row.queries == 50 * entering
+    assert row.hits == pytest.approx(table["parallel"][0].hits, rel=0.3)
 
 
 def test_queries_are_all_that_the_field_was_asked_for() -> None:
-    for name, config in STRATEGIES.items():
-        counted = Counted(SOFA)
+    counted = Counted(SOFA)
+    for case in of_field(counted, poster_view(24)):
+        before = counted.evaluations
         with torch.no_grad():
-            trace = render(counted, poster_view(24), config=config).trace
-        assert trace.total_evaluations == counted.evaluations, name
-        assert (trace.setup_evaluations > 0) == (name in ("coarse_to_fine", "fast"))
+            trace = case.render().trace
+        assert trace.total_evaluations == counted.evaluations - before, case.strategy
+        assert (trace.setup_evaluations > 0) == (case.strategy in ("coarse_to_fine", "fast"))
 
 
-def test_times_are_medians_of_five_runs_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+class Spheres(Decoder):
+    """The code is the radius, and something that changes nothing."""
+
+    def __init__(self) -> None:
+        super().__init__(NetworkSpecs(dims=(8,), code_length=2, latent_in=(), norm_layers=()))
+
+    def field(self, code: Tensor) -> SDF:
+        return sphere(code[0])
+
+    def forward(self, points: Tensor, code: Tensor) -> Tensor:
+        return points.norm(dim=-1) - code[..., 0]
+
+
+def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() -> None:
+    spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 1.0]]), ("ball",))
+    rows = {row.strategy: row for row, _ in measure(of_model(spheres, 0, poster_view(48)), repeats=1)}
+    assert len(rows) == COUNT
+    entering = int(meet_sphere(poster_view(48).rays()).meets.sum())
+    assert rows["original"].queries == rows["coarse_to_fine"].queries + entering
+    assert rows["fast_next"].setup_queries == rows["fast_camera"].setup_queries == 0
+    assert rows["fast_code"].setup_queries > 0, "another shape has another lattice"
+    for name in ("fast", "fast_next", "fast_camera", "fast_code"):
+        assert (rows[name].iou, rows[name].outliers) == (1.0, 0)
+    assert rows["fast_camera"].queries <= rows["fast_next"].queries < rows["fast"].queries
+
+
+def test_times_are_medians_of_runs_in_turn_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
     """The clock advances by what is asked for at each look; two looks to a run."""
-    config = {"dynamic": STRATEGIES["dynamic"]}
+    with torch.no_grad():
+        buffers = render(sphere(0.5), poster_view(8))
 
-    def row_of(*ticks: float) -> Row:
-        times = [sum(ticks[: n + 1]) for n in range(len(ticks))]
+    def measured(*runs: float) -> dict[str, tuple[float, int]]:
+        times = [sum(runs[: n // 2]) + (n % 2) * runs[n // 2] for n in range(2 * len(runs))]
         monkeypatch.setattr("distrace.bench.time.perf_counter", iter(times).__next__)
-        ((row, _),) = ablation(sphere(0.5), poster_view(8), config)
-        return row
+        results = in_turn({"first": lambda: buffers, "second": lambda: buffers}, 3)
+        return {name: result[1:] for name, result in results.items()}
 
-    fast = row_of(*(0, 9), *(0, 3), *(0, 1), *(0, 2), *(0, 5), *(0, 4))  # the first run is to warm up
-    assert (fast.seconds, fast.runs) == (3, 5)
-    slow = row_of(0, LONG + 1)
-    assert (slow.seconds, slow.runs) == (LONG + 1, 1)
+    assert measured(9, 9, 1, 4, 3, 5, 2, 9) == {"first": (2, 3), "second": (5, 3)}  # one of each is to warm up
+    assert measured(LONG + 1, 9, 4, 5, 9) == {"first": (LONG + 1, 1), "second": (5, 3)}
 
 
 def test_errors_are_measured_against_the_truth_that_is_given() -> None:
@@ -126,7 +166,7 @@ def test_errors_are_measured_against_the_truth_that_is_given() -> None:
         buffers = render(sphere(0.5), camera)
     truth = buffers.depth + 0.25
     truth[0, 0] = 2.0  # a pixel that the rendering misses
-    row = measured("wrong", buffers, truth, 1.0, 1)
+    ((row, _),) = measure([Case("wrong", lambda: buffers, truth)], repeats=1)
     assert (row.depth_mean, row.depth_max) == (pytest.approx(0.25), pytest.approx(0.25))
     assert row.outliers == row.hits == int(buffers.mask.sum())
     assert row.iou == pytest.approx(row.hits / (row.hits + 1))
@@ -134,7 +174,7 @@ def test_errors_are_measured_against_the_truth_that_is_given() -> None:
 
 def test_a_view_that_shows_nothing_is_refused() -> None:
     with pytest.raises(ValueError, match="shows nothing"):
-        next(ablation(lambda points: points.norm(dim=-1) + 1, poster_view(8), STRATEGIES))
+        measure(of_field(lambda points: points.norm(dim=-1) + 1, poster_view(8)), repeats=1)
 
 
 def test_the_reference_keeps_the_shape_of_the_rays() -> None:

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+import av
 import numpy as np
 import pytest
 import torch
@@ -13,11 +14,13 @@ from PIL import Image
 from test_train import SPECS, of_sphere, spheres
 
 import distrace.cli
+import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.data.samples import write_samples
 from distrace.data.view import View, save_view
 from distrace.rays import meet_sphere
+from distrace.render import Buffers, render
 from distrace.train import TrainConfig, start, train
 
 RADII = (0.45, 0.6)
@@ -105,6 +108,76 @@ def test_render_counts_what_the_clearance_costs(model: Path, run: Command, tmp_p
     assert facts["clearance_evaluations"] > 0
     assert facts["setup_evaluations"] == 0
     assert facts["strategy"] == "parallel"
+
+
+@pytest.mark.parametrize(("strategy", "size"), [("fast", 33), ("dynamic", 16)])
+def test_render_in_an_orbit_also_writes_movies(
+    strategy: str, size: int, model: Path, run: Command, tmp_path: Path
+) -> None:
+    view = ("--code", 1, "--distance", 2.5, "--focal-mm", 32, "--size", size, "--strategy", strategy)
+    run("render", model, *view, "--out", tmp_path / "still")
+    run("render", model, *view, "--orbit", 3, "--out", tmp_path / "turn")
+    still, turn = tmp_path / "still", tmp_path / "turn"
+    assert names(turn) == names(still) | {"turntable.mp4", "turntable.gif"}
+    for name in names(still) - {"result.json"}:
+        assert (turn / name).read_bytes() == (still / name).read_bytes(), "the first view is the one without a turn"
+    with av.open(str(turn / "turntable.mp4")) as movie:
+        frames = [frame.to_ndarray(format="rgb24") for frame in movie.decode(video=0)]
+    assert [frame.shape for frame in frames] == 3 * [(size + size % 2, size + size % 2, 3)]
+    first = np.asarray(Image.open(turn / "shaded.png")).astype(int)
+    assert np.abs(frames[0][:size, :size] - first).mean() < 5
+    assert Image.open(turn / "turntable.gif").n_frames == 3
+
+
+def test_an_orbit_counts_all_its_frames_and_reuses_what_the_first_has_learnt(
+    model: Path, run: Command, tmp_path: Path
+) -> None:
+    run("render", model, "--orbit", 3, "--clearance", "--out", tmp_path / "turn", *VIEW)
+    facts = result(tmp_path / "turn", "frames", "evaluations_per_visible_pixel")
+    assert facts["frames"] == 3
+    first, *others = singly = [still_facts(model, run, tmp_path / str(k), 30 + 120 * k) for k in range(3)]
+    assert facts["setup_evaluations"] == first["setup_evaluations"] > 0, "the lattice is built once"
+    assert facts["evaluations"] == first["evaluations"] + sum(
+        other["evaluations"] - other["setup_evaluations"] for other in others
+    )
+    assert facts["gradient_evaluations"] == sum(still["gradient_evaluations"] for still in singly)
+    assert facts["clearance_evaluations"] == first["clearance_evaluations"] > 0, "the first view's alone"
+    hits = [still["outcomes"]["hit"] for still in singly]
+    per_pixel = facts["evaluations_per_visible_pixel"]
+    assert facts["evaluations"] == pytest.approx(np.dot(per_pixel, hits))
+    assert per_pixel[0] == pytest.approx(first["evaluations"] / hits[0])
+    assert "frames" not in first
+    assert "evaluations_per_visible_pixel" not in first
+
+
+def still_facts(model: Path, run: Command, out: Path, azimuth: float) -> dict:
+    run("render", model, "--azimuth", azimuth, "--clearance", "--out", out, *VIEW)
+    return result(out)
+
+
+def test_an_orbit_that_sees_nothing_is_a_white_movie(model: Path, run: Command, tmp_path: Path) -> None:
+    run("render", model, "--orbit", 2, "--distance", 9000, "--focal-mm", 1, "--size", 16, "--out", tmp_path)
+    facts = result(tmp_path)
+    assert facts["outcomes"]["hit"] == 0
+    assert facts["evaluations_per_visible_pixel"] == [None, None]
+    assert (np.asarray(Image.open(tmp_path / "turntable.gif").convert("RGB")) == 255).all()
+
+
+def test_ctrl_c_in_an_orbit_leaves_the_first_view_and_no_half_movie(
+    model: Path, run: Command, capsys: pytest.CaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rendered = []
+
+    def interrupted(*arguments: object, **options: object) -> Buffers:
+        if rendered:
+            raise KeyboardInterrupt
+        rendered.append(render(*arguments, **options))
+        return rendered[0]
+
+    monkeypatch.setattr(distrace.movie, "render", interrupted)
+    said = one_line(run, capsys, ("render", model, "--orbit", 3, "--out", tmp_path, *VIEW), status=130)
+    assert "stopped" in said
+    assert names(tmp_path) == {"buffers.npz", "depth.png", "normal.png", "mask.png", "shaded.png"}
 
 
 def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
@@ -217,6 +290,10 @@ BAD = [
     ("render {model} --size 4000000", "not enough memory"),
     ("render {model} --strategy dynamic --steps 0", "steps=0"),
     ("render {model} --steps 5", "fast counts none"),
+    ("render {model} --orbit 1", "an orbit of 1 frames"),
+    ("render {model} --orbit 0", "an orbit of 0 frames"),
+    ("render {model} --orbit -3", "an orbit of -3 frames"),
+    ("render {model} --orbit many", "--orbit"),
     ("render {model} --focal-mm 0", "focal length"),
     ("render {model} --sensor-mm -1", "focal length"),
     ("render {model} --azimuth nan", "nan"),

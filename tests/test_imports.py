@@ -27,7 +27,20 @@ ORDER = [
     ),
     *("losses", "warp", "metrics", "mesh", "data", "targets"),
     *("train", "resume", "fit", "fit_samples"),
-    *("bench", "ablation", "fields", "growth", "evaluate", "page", "charts", "scene", "report", "viewer", "cli"),
+    *(
+        "bench",
+        "ablation",
+        "fields",
+        "growth",
+        "evaluate",
+        "page",
+        "charts",
+        "scene",
+        "tables",
+        "report",
+        "viewer",
+        "cli",
+    ),
 ]
 SHELL = set(ORDER[ORDER.index("bench") :])
 FILES = {path.relative_to(SOURCE).with_suffix("").as_posix(): path for path in SOURCE.rglob("*.py")}

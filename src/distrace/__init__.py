@@ -21,6 +21,7 @@ from distrace.rays import Rays as Rays
 from distrace.rays import meet_sphere as meet_sphere
 from distrace.render import Buffers as Buffers
 from distrace.render import render as render
+from distrace.render import render_each as render_each
 from distrace.surface import attach as attach
 from distrace.surface import clearance as clearance
 from distrace.surface import normals as normals

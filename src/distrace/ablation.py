@@ -16,6 +16,7 @@ from distrace.trace import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
 
 NAIVE_RAYS = 100  # of which the row `naive` is a sample
 ORIGINAL_BATCH = 100_000  # points
+COUNT = 10  # of rows
 TURN = 10.0  # degrees to the next view
 STEP_DEGREES, STEP_CODE = 1.0, 0.01  # what a step of an optimisation moves: the camera, the code relative to its length
 
@@ -38,16 +39,15 @@ def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
     yield Case("original", lambda: _original(model, latent, camera), cases[-1].truth)
     yield cases[-1]
     first = render(sdf, camera)
-    turned = _turned(camera, TURN)
-    yield Case("fast_next", lambda: render(sdf, turned, lattice=first.lattice), reference_depth(sdf, turned))
-    nudged = _turned(camera, STEP_DEGREES)
+    aside, nudged = camera.turned(TURN), camera.turned(STEP_DEGREES)
+    yield Case("fast_next", lambda: render(sdf, aside, lattice=first.lattice), reference_depth(sdf, aside))
     yield Case(
-        "fast_camera_step",
+        "fast_camera",
         lambda: render(sdf, nudged, lattice=first.lattice, last=first.trace),
         reference_depth(sdf, nudged),
     )
     moved = model.field(latent + STEP_CODE * latent.norm() * _direction(latent))
-    yield Case("fast_code_step", lambda: render(moved, camera, last=first.trace), reference_depth(moved, camera))
+    yield Case("fast_code", lambda: render(moved, camera, last=first.trace), reference_depth(moved, camera))
 
 
 def _naive(sdf: SDF, camera: Camera, truth: Tensor, radius: float) -> Case:
@@ -58,13 +58,17 @@ def _naive(sdf: SDF, camera: Camera, truth: Tensor, radius: float) -> Case:
     chosen = entering[torch.randperm(len(entering), generator=torch.Generator().manual_seed(0))[:NAIVE_RAYS]]
     some = Bounds(bounds.near[chosen], bounds.far[chosen])
 
+    def alone(k: int) -> Trace:
+        ray, part = rays[chosen[k : k + 1]], Bounds(some.near[k : k + 1], some.far[k : k + 1])
+        trace = sphere_trace(sdf, ray, part, PARALLEL)
+        for _ in range(int(trace.evaluations), PARALLEL.steps):
+            sdf(ray.at(trace.stopped))
+        return replace(trace, evaluations=torch.full_like(trace.evaluations, PARALLEL.steps))
+
     def render_each() -> Buffers:
-        alone = [
-            sphere_trace(sdf, rays[chosen[k : k + 1]], Bounds(some.near[k : k + 1], some.far[k : k + 1]), PARALLEL)
-            for k in range(len(chosen))
-        ]
-        images = {name: torch.cat([trace.images()[name] for trace in alone]) for name in alone[0].images()}
-        return Buffers(sdf, rays[chosen], cosines[chosen], Trace(**images), radius)
+        traces = [alone(k) for k in range(len(chosen))]
+        images = {name: torch.cat([trace.images()[name] for trace in traces]) for name in traces[0].images()}
+        return Buffers(sdf, rays[chosen], cosines[chosen], replace(traces[0], **images), radius)
 
     return Case("naive", render_each, truth.reshape(-1)[chosen], len(chosen) / len(entering))
 
@@ -80,14 +84,6 @@ def _original(model: Model, code: Tensor, camera: Camera) -> Buffers:
     met = torch.isfinite(buffers.trace.closest)
     sdf(buffers.rays[met].at(buffers.trace.closest[met]))
     return replace(buffers, trace=replace(buffers.trace, evaluations=buffers.trace.evaluations + met))
-
-
-def _turned(camera: Camera, degrees: float) -> Camera:
-    """The same camera, moved around the vertical axis."""
-    angle = torch.tensor(degrees).deg2rad()
-    turn = torch.eye(4)
-    turn[0, 0], turn[0, 2], turn[2, 0], turn[2, 2] = angle.cos(), angle.sin(), -angle.sin(), angle.cos()
-    return replace(camera, T_world_camera=turn.to(camera.T_world_camera) @ camera.T_world_camera)
 
 
 def _direction(like: Tensor) -> Tensor:

@@ -1,7 +1,7 @@
 """Measuring ways to trace a view, against a reference that takes no chances."""
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from statistics import median
 
@@ -100,31 +100,36 @@ def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tens
     return camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius)))
 
 
-def measure(cases: Iterable[Case], repeats: int, said: Callable[[str], None] = str) -> list[tuple[Row, Buffers]]:
-    """Runs all cases in turn, once to warm up and then `repeats` times; a row's time is its median.
+def measure(cases: Iterable[Case], repeats: int, said: Callable[[str], object] = str) -> list[tuple[Row, Buffers]]:
+    """Runs all cases in turn; a row's time is its median."""
+    cases = list(cases)
+    results = in_turn({case.strategy: case.render for case in cases}, repeats, said)
+    return [(_row(case, *results[case.strategy]), results[case.strategy][0]) for case in cases]
 
-    A case that takes over a minute runs once. `said` is told what was done.
+
+def in_turn(
+    runs: Mapping[str, Callable[[], Buffers]], repeats: int, said: Callable[[str], object] = str
+) -> dict[str, tuple[Buffers, float, int]]:
+    """Each once to warm up and then `repeats` times, in turn: the last result, the median time, and of how many runs.
+
+    What takes over a minute runs once. `said` is told what was done.
     """
-    cases, seconds, shown = list(cases), {}, {}
+    results, seconds = {}, {name: [] for name in runs}
     for turn in range(repeats + 1 if repeats > 1 else 1):
-        for case in cases:
-            times = seconds.setdefault(case.strategy, [])
-            if turn and times[0] > LONG:
+        for name, run in runs.items():
+            if turn and seconds[name][0] > LONG:
                 continue
-            shown[case.strategy], taken = _timed(case)
-            times.append(taken)
-            said(f"{case.strategy}: {taken:.1f} s")
+            results[name], taken = _timed(run)
+            seconds[name].append(taken)
+            said(f"{name}: {taken:.1f} s")
     timed = {name: times[1:] or times for name, times in seconds.items()}
-    return [
-        (_row(case, shown[case.strategy], median(timed[case.strategy]), len(timed[case.strategy])), shown[case.strategy])
-        for case in cases
-    ]
+    return {name: (results[name], median(times), len(times)) for name, times in timed.items()}
 
 
 @torch.no_grad()
-def _timed(case: Case) -> tuple[Buffers, float]:
+def _timed(run: Callable[[], Buffers]) -> tuple[Buffers, float]:
     began = time.perf_counter()
-    buffers = case.render()
+    buffers = run()
     if buffers.trace.distance.is_cuda:
         torch.cuda.synchronize()
     return buffers, time.perf_counter() - began

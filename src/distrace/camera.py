@@ -148,6 +148,12 @@ class Camera:
             self, intrinsics=moved, height=min(height, self.height - top), width=min(width, self.width - left)
         )
 
+    def turned(self, degrees: float) -> "Camera":
+        """The camera carried around the world's y axis, anticlockwise from above."""
+        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        turn = self.T_world_camera.new_tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
+        return replace(self, T_world_camera=turn @ self.T_world_camera)
+
     def scaled(self, factor: float) -> "Camera":
         """The same view of a world whose lengths are × factor."""
         pose = self.T_world_camera.clone()

@@ -40,7 +40,9 @@ def fast_trace(
     if lattice is None:
         lattice, setup = _prepared(sdf, camera.intrinsics.detach(), radius, config)
     elif lattice.radius != radius:
-        raise ValueError(f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out")
+        raise ValueError(
+            f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out"
+        )
     unit, steepness = _unit(sdf, radius, lattice.steepness), lattice.steepness
     last = last and last.scaled(1 / radius, 1 / steepness)
     trace = _tiled(unit, camera.detach().scaled(1 / radius), config, lattice, last)
@@ -48,7 +50,7 @@ def fast_trace(
 
 
 def _prepared(sdf: SDF, like: Tensor, radius: float, config: FastConfig) -> tuple[Lattice, int]:
-    """A lattice of the field; where that turns out to be too steep, another one of the field divided by its steepness."""
+    """A lattice of the field; where that turns out to be too steep, one of the field divided by its steepness."""
     lattice = build(_unit(sdf, radius, 1.0), config.lattice, like)
     evaluations, steepness = lattice.evaluations, lattice.measured_steepness()
     if steepness > config.lattice.steepest:

@@ -17,6 +17,7 @@ from distrace.trace import Outcome
 CLAMP = 0.02
 THICKNESS = 0.004
 FREQUENCY, AMPLITUDE = 30.0, 0.06
+COUNT = 5 * len(STRATEGIES)  # of rows
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,15 @@ def field_rows(decoder: SDF, camera: Camera) -> Iterator[FieldRow]:
                 buffers = render(hard.sdf, camera, config=config)
             wrong = _wrong(buffers.depth, truth)
             exhausted = buffers.trace.outcome == Outcome.EXHAUSTED
-            counts = [int(mask.sum()) for mask in (torch.isfinite(truth), wrong, wrong & exhausted, exhausted)]
-            yield FieldRow(name, strategy, *counts, buffers.trace.total_evaluations)
+            yield FieldRow(
+                name,
+                strategy,
+                visible=int(torch.isfinite(truth).sum()),
+                wrong=int(wrong.sum()),
+                admitted=int((wrong & exhausted).sum()),
+                exhausted=int(exhausted.sum()),
+                queries=buffers.trace.total_evaluations,
+            )
 
 
 def _wrong(depth: Tensor, truth: Tensor) -> Tensor:
@@ -76,7 +84,7 @@ def _wrong(depth: Tensor, truth: Tensor) -> Tensor:
 
 
 def _wild(like: Tensor) -> SDF:
-    """A sphere and waves in random directions, as a network of sines has them (Sitzmann et al., *SIREN*, NeurIPS 2020)."""
+    """A sphere and waves in random directions, as a network of sines has (Sitzmann et al., *SIREN*, NeurIPS 2020)."""
     generator = torch.Generator().manual_seed(0)
     directions = torch.nn.functional.normalize(torch.randn(16, 3, generator=generator), dim=-1).to(like) * FREQUENCY
     phases = (torch.rand(16, generator=generator) * 6.283).to(like)

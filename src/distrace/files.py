@@ -25,6 +25,11 @@ def written(path: Path) -> Iterator[BinaryIO]:
         part.unlink(missing_ok=True)
 
 
+def save_text(path: Path, text: str) -> None:
+    with written(path) as file:
+        file.write(text.encode())
+
+
 def save_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
     """An `.npz` of tensors."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}

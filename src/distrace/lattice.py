@@ -18,7 +18,9 @@ class LatticeConfig:
 
     cells: int = 7
     levels: int = 3
-    steepest: float = 1.2  # a bound on |∇f|: no zero is nearer to a corner than |f| / steepest; steeper fields are scaled
+    steepest: float = (
+        1.2  # a bound on |∇f|: no zero is nearer to a corner than |f| / steepest; steeper fields are scaled
+    )
 
     def __post_init__(self) -> None:
         if self.cells < 2 or self.levels < 1 or not self.steepest > 0:

@@ -1,8 +1,6 @@
 """Movies: one field as many cameras see it, and pictures in a row as MP4 and as GIF."""
 
-import math
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -28,11 +26,11 @@ BT709 = 1  # H.264's number for the colours, the curve and the matrix of HD tele
 def turntable(camera: Camera, frames: int) -> list[Camera]:
     """Cameras in even steps around the world's vertical axis, anticlockwise from above, from the given one on.
 
-    Raises `ValueError` for less than two frames.
+    Raises `ValueError` for fewer than two frames.
     """
     if frames < 2:
         raise ValueError(f"an orbit of {frames} frames was asked for; a turn takes at least 2")
-    return [_turned(camera, 2 * math.pi * frame / frames) for frame in range(frames)]
+    return [camera.turned(360 * frame / frames) for frame in range(frames)]
 
 
 def filmed(
@@ -54,7 +52,8 @@ def save_mp4(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
 
     Its sides are even: odd ones get a white row below, a white column on the right. Raises `ValueError` for no picture.
     """
-    even = _even(_some(pictures))
+    _, height, width, _ = _some(pictures).shape
+    even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
     with written(path) as file:  # by its name: to bring the index to the front, the file is read again
         with av.open(file.name, "w", format="mp4", options={"movflags": "faststart"}) as movie:
             stream = movie.add_stream("libx264", rate=1 / frame, options={"crf": "18"})
@@ -73,29 +72,16 @@ def save_gif(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
     """
     _, _, width, _ = _some(pictures).shape
     palette = Image.fromarray(pictures.reshape(-1, width, 3)).quantize()
-    first, *others = (Image.fromarray(picture).quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures)
+    images = [Image.fromarray(picture) for picture in pictures]
+    first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     with written(path) as file:
-        milliseconds = round(1000 * frame)
-        first.save(file, format="GIF", save_all=True, append_images=others, duration=milliseconds, loop=0)
-
-
-def _turned(camera: Camera, angle: float) -> Camera:
-    """The camera carried around the y axis by an angle in radians."""
-    cosine, sine = math.cos(angle), math.sin(angle)
-    rows = [[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]]
-    return replace(camera, T_world_camera=camera.T_world_camera.new_tensor(rows) @ camera.T_world_camera)
+        first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 * frame), loop=0)
 
 
 def _some(pictures: Pictures) -> Pictures:
     if not len(pictures):
         raise ValueError("no picture was given; a movie needs at least one")
     return pictures
-
-
-def _even(pictures: Pictures) -> Pictures:
-    """H.264 halves the resolution of colours."""
-    _, height, width, _ = pictures.shape
-    return np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
 
 
 def _encodable(picture: Picture) -> av.VideoFrame:

@@ -129,6 +129,13 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
     return Html(f'<div class="scroll"><table>{head}<tbody>{lines}</tbody></table></div>')
 
 
+def short(value: object) -> str:
+    """A value as a cell: counts with separators, other numbers in as few digits as tell."""
+    if isinstance(value, float):
+        return f"{value:.1e}" if 0 < abs(value) < 0.01 else f"{value:.5g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
 def key(colours: Mapping[str, Colour]) -> Html:
     """What the colours of a picture mean."""
     entries = (f'<span><i style="background:rgb{colour}"></i>{escape(name)}</span>' for name, colour in colours.items())

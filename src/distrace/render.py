@@ -1,7 +1,9 @@
 """The whole way from a field and a camera to images, on one page."""
 
-from dataclasses import dataclass, replace
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import wraps
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
@@ -17,7 +19,21 @@ from distrace.rays import Rays, meet_sphere
 from distrace.trace import MARCHES, Trace, TraceConfig, sphere_trace
 
 Config = TraceConfig | FastConfig
+Image = Callable[["Buffers"], Tensor]
 STRATEGIES: dict[str, Config] = {**MARCHES, "fast": FastConfig()}
+
+
+def _kept(image: Image) -> property:
+    """Makes an image when it is first asked for; once with its gradients, and once without where grad mode is off."""
+
+    @wraps(image)
+    def read(buffers: "Buffers") -> Tensor:
+        key = image.__name__, torch.is_grad_enabled()
+        if key not in buffers.images:
+            buffers.images[key] = image(buffers)
+        return buffers.images[key]
+
+    return property(read)
 
 
 @dataclass(frozen=True)
@@ -30,12 +46,13 @@ class Buffers:
     trace: Trace
     radius: float
     lattice: Lattice | None = None  # the fast tracer's, for other views of the same field
+    images: dict[tuple[str, bool], Tensor] = field(default_factory=dict, init=False, repr=False)  # made so far
 
     @property
     def mask(self) -> Bool[Tensor, "*batch"]:
         return self.trace.hit
 
-    @cached_property
+    @_kept
     def distance(self) -> Float[Tensor, "*batch"]:
         """Along the ray; `inf` where nothing was hit."""
         hit = self.trace.hit
@@ -44,27 +61,27 @@ class Buffers:
         attached = surface.attach(self.sdf, self.rays[hit], self.trace.distance[hit])
         return self.trace.distance.masked_scatter(hit, attached)
 
-    @cached_property
+    @_kept
     def depth(self) -> Float[Tensor, "*batch"]:
         """Along the optical axis; `inf` where nothing was hit."""
         missed = ~self.trace.hit
         along = self.distance.masked_fill(missed, 0.0)  # inf times a zero gradient would be NaN
         return (along * self.cosines).masked_fill(missed, torch.inf)
 
-    @cached_property
+    @_kept
     def points(self) -> Float[Tensor, "hits 3"]:
         """Where the rays of the mask hit, in the world."""
         hit = self.trace.hit
         return self.rays[hit].at(self.distance[hit])
 
-    @cached_property
+    @_kept
     def normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
         hit = self.trace.hit[..., None].expand(*self.trace.hit.shape, 3)
         empty = torch.zeros_like(self.rays.directions)
         return empty.masked_scatter(hit, surface.normals(self.sdf, self.points))
 
-    @cached_property
+    @_kept
     def clearance(self) -> Float[Tensor, "*batch"]:
         """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations."""
         met = torch.isfinite(self.trace.closest)
@@ -104,6 +121,20 @@ def render(
     trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), replace(config, steps=steps), start)
     trace = replace(trace, setup_evaluations=trace.setup_evaluations + setup)
     return Buffers(sdf, rays, camera.cosines(), trace, radius)
+
+
+def render_each(sdfs: Sequence[SDF], cameras: Camera | Sequence[Camera], **options: Any) -> list[Buffers]:
+    """Several fields, each as its own camera sees it, or all as one does: `render` of each, with its options.
+
+    Raises `ValueError` for another number of cameras than of fields. (Several cameras of one field are a batch of
+    `Camera`, which `render` takes.)
+    """
+    cameras = [cameras] * len(sdfs) if isinstance(cameras, Camera) else cameras
+    if len(cameras) != len(sdfs):
+        raise ValueError(
+            f"{len(sdfs)} fields and {len(cameras)} cameras were given; give one camera, or as many as fields"
+        )
+    return [render(sdf, camera, **options) for sdf, camera in zip(sdfs, cameras, strict=True)]
 
 
 def render_rays(

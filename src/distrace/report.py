@@ -8,11 +8,11 @@ import trimesh
 from jaxtyping import Bool, Float, UInt8
 
 from distrace import shading
-from distrace.metrics import POINTS, Chamfer, iou
 from distrace.charts import curves
+from distrace.metrics import POINTS, Chamfer, iou
 from distrace.page import Html, figure, key, page, paragraph, ramp, row, section, table
-from distrace.scene import scene
 from distrace.render import Buffers
+from distrace.scene import scene
 from distrace.shading import Picture
 
 DENSE = 0.05  # the share of pixels with a depth above which dots would hide each other

@@ -8,10 +8,11 @@ from contextlib import redirect_stderr
 import torch
 import tyro
 
+from distrace.cli.bench import Bench
 from distrace.cli.complete import Complete, Demo
 from distrace.cli.console import errors
 from distrace.cli.data import Data, Sample
-from distrace.cli.measure import Bench, Evaluate
+from distrace.cli.evaluate import Evaluate
 from distrace.cli.show import Mesh, Render
 from distrace.cli.train import Train
 

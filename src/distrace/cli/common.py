@@ -14,6 +14,7 @@ from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
 from distrace.cli.console import console
 from distrace.files import save_arrays, written
+from distrace.page import short
 from distrace.render import Buffers
 from distrace.report import View
 
@@ -50,14 +51,13 @@ def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Prints rows of the same keys; numbers in as few digits as tell."""
-    shown = Table(*rows[0], padding=(0, 1, 0, 0), box=None)
-    for row in rows:
-        shown.add_row(*(_short(value) for value in row.values()))
-    console.print(shown)
-
-
-def _short(value: object) -> str:
-    if isinstance(value, float):
-        return f"{value:.1e}" if 0 < abs(value) < 0.01 else f"{value:.5g}"
-    return f"{value:,}" if isinstance(value, int) else str(value)
+    """Prints rows of the same keys, not narrower than they are."""
+    cells = [[short(value) for value in row.values()] for row in rows]
+    shown = Table(box=None, padding=(0, 1, 0, 0))
+    for name, column in zip(rows[0], zip(*cells)):
+        numeric = all(isinstance(row[name], int | float) for row in rows)
+        width = max(len(name), *(len(cell) for cell in column))
+        shown.add_column(name, justify="right" if numeric else "left", min_width=width, no_wrap=True)
+    for line in cells:
+        shown.add_row(*line)
+    console.print(shown, soft_wrap=True, crop=False)

@@ -18,6 +18,7 @@ from distrace.evaluate import (
     summary,
     training_results,
 )
+from distrace.files import save_text
 from distrace.fit import FitConfig
 from distrace.page import figure, page, section, table
 
@@ -71,5 +72,5 @@ def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
         section("Table", table(list(rows[0]), cells)),
         section("Shapes", figure(sheet, "true surface, then each method")),
     ]
-    (run.out / "index.html").write_text(page(f"{name}: {model}", lead, parts))
+    save_text(run.out / "index.html", page(f"{name}: {model}", lead, parts))
     run.finish({"rows": rows, "summary": totals, **origin()})

@@ -17,6 +17,7 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
 from distrace.render import STRATEGIES, Buffers, Config
 from distrace.report import View
+from distrace.shading import Picture
 from distrace.trace import Outcome, Trace, TraceConfig
 
 
@@ -36,7 +37,8 @@ class Tally:
     @property
     def per_visible_pixel(self) -> float | None:
         """Evaluations; None where nothing is seen."""
-        return self.evaluations / self.outcomes["hit"] if self.outcomes["hit"] else None
+        hits = self.outcomes["hit"]
+        return self.evaluations / hits if hits else None
 
 
 @dataclass(frozen=True)
@@ -65,10 +67,12 @@ class Render:
         counted = Counted(opened(self.model, run.device).field(self.code))
         with torch.no_grad():
             views = self._saving_first(filmed(counted, cameras, config=self._config()), camera)
-            tallies = self._tallies(views) if self.orbit is None else self._turning(views, self.orbit)
+            tallies = (
+                [Tally.of(view.trace) for view in views] if self.orbit is None else _movie(run.out, views, self.orbit)
+            )
         facts = _facts(tallies, counted.evaluations)
-        across = f"{self.size * self.size * len(tallies)} pixels"
-        console.print(f"{facts['outcomes']['hit']} of {across} hit, {facts['evaluations']} evaluations")
+        pixels = self.size * self.size * len(tallies)
+        console.print(f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations")
         run.finish({**facts, "strategy": self.strategy, **({} if self.orbit is None else _each(tallies))})
 
     def _camera(self) -> Camera:
@@ -99,6 +103,38 @@ class Render:
                 f"--steps {self.steps} was given, and fast counts none; choose another --strategy, or no steps"
             )
         return replace(config, steps=self.steps)
+
+
+def _movie(folder: Path, views: Iterator[Buffers], frames: int) -> list[Tally]:
+    """Writes the shaded views as a movie; what each of them took."""
+    tallies: list[Tally] = []
+    pictures: list[Picture] = []
+    with progress("turning", frames) as bar:
+        for view in views:
+            tallies.append(Tally.of(view.trace))
+            pictures.append(View.of(view).shaded)
+            bar.advance(f"{tallies[-1].evaluations} evaluations")
+    save_mp4(folder / "turntable.mp4", np.stack(pictures))
+    save_gif(folder / "turntable.gif", np.stack(pictures))
+    return tallies
+
+
+def _facts(tallies: list[Tally], evaluations: int) -> dict[str, Any]:
+    """Sums over all images; `evaluations` is how often the field was asked for anything at all."""
+    traced = sum(tally.evaluations for tally in tallies)
+    outcomes: dict[str, int] = {name: sum(tally.outcomes[name] for tally in tallies) for name in tallies[0].outcomes}
+    return {
+        "evaluations": traced,
+        "setup_evaluations": sum(tally.setup_evaluations for tally in tallies),
+        "gradient_evaluations": outcomes["hit"],  # the normals
+        "clearance_evaluations": evaluations - traced - outcomes["hit"],
+        "outcomes": outcomes,
+    }
+
+
+def _each(tallies: list[Tally]) -> dict[str, Any]:
+    """What a movie tells beyond that of its frames, one by one."""
+    return {"frames": len(tallies), "evaluations_per_visible_pixel": [tally.per_visible_pixel for tally in tallies]}
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,90 @@
+"""`bench`: what tracing costs and how far it is off, as JSON, as a page and in the terminal."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+import tyro
+
+from distrace import ablation, fields, growth, tables
+from distrace.bench import measure, poster_view
+from distrace.checkpoint import Model
+from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.console import Run, origin, progress, start
+from distrace.files import save_text
+from distrace.shading import save_png, side_by_side
+
+HIDDEN = ("model", "share", "runs")  # from the terminal
+SHORT: dict[str, str] = {
+    "setup_queries": "set-up",
+    "per_pixel": "per px",
+    "depth_mean": "mean",
+    "depth_p99": "p99",
+    "depth_max": "max",
+}
+
+
+@dataclass(frozen=True)
+class Bench:
+    """Measure what tracing costs and how far it is off, against a reference that takes no chances."""
+
+    what: tyro.conf.Positional[Literal["trace", "fields", "growth"]]
+    """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
+    with the size of the image, of the network and the number of views"""
+    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    out: Path = Path("out/bench")
+    code: int = 0  # which training shape
+    size: int = 512  # pixels along each side, of `trace` and `fields`
+    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        model = opened(self.model, run.device)
+        {"trace": self._trace, "fields": self._fields, "growth": self._growth}[self.what](run, model)
+
+    def _trace(self, run: Run, model: Model) -> None:
+        camera, cases = poster_view(self.size).to(run.device), []
+        with progress("references", ablation.COUNT) as bar:
+            for case in ablation.of_model(model, self.code, camera):
+                cases.append(case)
+                bar.advance(case.strategy)
+        with progress("runs", len(cases) * (self.repeats + 1 if self.repeats > 1 else 1)) as bar:
+            measured = measure(cases, self.repeats, bar.advance)
+        truths = [case.truth.cpu().numpy() for case in cases]
+        maps = {row.strategy: tables.query_map(buffers) for row, buffers in measured if row.strategy in tables.MAPPED}
+        save_png(run.out / "evaluations.png", side_by_side(list(maps.values())))
+        save_text(run.out / "index.html", tables.trace_page(self.model, measured, truths))
+        _finish(run, [{"model": self.model, **row.asdict()} for row, _ in measured])
+
+    def _fields(self, run: Run, model: Model) -> None:
+        rows = []
+        with progress("fields", fields.COUNT) as bar:
+            for row in fields.field_rows(model.field(self.code), poster_view(self.size).to(run.device)):
+                rows.append(row)
+                bar.advance(f"{row.field}, {row.strategy}")
+        save_text(run.out / "index.html", tables.fields_page(rows))
+        _finish(run, [{"model": self.model, **row.asdict()} for row in rows])
+
+    def _growth(self, run: Run, model: Model) -> None:
+        field, rows = model.field(self.code), []
+        axes = (
+            growth.by_size(field, self.repeats),
+            growth.by_network(self.repeats),
+            growth.by_views(field, self.repeats),
+        )
+        with progress("growth", growth.COUNT) as bar, torch.no_grad():
+            for axis in axes:
+                for row in axis:
+                    rows.append(row)
+                    bar.advance(f"{row.axis} {row.value}, {row.strategy}: {row.seconds:.2f} s")
+        memory = {size: growth.peak_memory(self.model, self.code, size) for size in growth.MEASURED}
+        save_text(run.out / "index.html", tables.growth_page(rows, memory))
+        recorded = [{"model": self.model, **row.asdict()} for row in rows]
+        _finish(run, recorded, memory_mib={str(size): mib for size, mib in memory.items()})
+
+
+def _finish(run: Run, rows: list[dict[str, Any]], **more: object) -> None:
+    show_table([{SHORT.get(key, key): value for key, value in row.items() if key not in HIDDEN} for row in rows])
+    run.finish({"rows": rows, **more, **origin(), "evaluations": sum(row["queries"] for row in rows)})

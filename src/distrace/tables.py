@@ -1,0 +1,107 @@
+"""Pages of the benchmarks: tables, charts, and maps of where queries and errors are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from distrace import shading
+from distrace.bench import Row
+from distrace.charts import bars, growth
+from distrace.fields import FieldRow
+from distrace.growth import GrowthRow
+from distrace.page import Html, figure, page, paragraph, ramp, section, short, table
+from distrace.page import row as beside
+from distrace.render import Buffers
+from distrace.shading import Picture
+
+MAPPED = ("coarse_to_fine", "original", "fast", "fast_next")
+MOST_QUERIES, LARGEST_ERROR = 20.0, 1e-3
+
+
+def trace_page(model: str, measured: Sequence[tuple[Row, Buffers]], truths: Sequence[np.ndarray]) -> str:
+    """What each strategy cost and missed on the poster's view of a model."""
+    rows = [row for row, _ in measured]
+    naive = next((f" naive: extrapolated from {row.share:.2%} of its rays." for row in rows if row.share < 1), "")
+    maps = [
+        (row.strategy, query_map(buffers), error_map(buffers, truth))
+        for (row, buffers), truth in zip(measured, truths, strict=True)
+        if row.strategy in MAPPED
+    ]
+    return page(
+        f"Tracing {model}",
+        "The poster's view, in one process, runs in turn. A pixel off by more than a thousandth is an outlier." + naive,
+        [
+            section("Table", table(*_cells(rows))),
+            section("Queries", bars({row.strategy: row.queries for row in rows}, "network evaluations")),
+            section("Time", bars({row.strategy: row.seconds for row in rows}, "seconds")),
+            section(
+                "Where the queries are",
+                beside(*(figure(queries, name) for name, queries, _ in maps)),
+                _scale("none", f"{MOST_QUERIES:.0f} evaluations or more", 0.5),
+            ),
+            section(
+                "Where depth is off",
+                beside(*(figure(errors, name) for name, _, errors in maps)),
+                _scale(f"too near by {LARGEST_ERROR}", f"too far by {LARGEST_ERROR}", 0.0),
+                paragraph("Pixels that are seen in one image only are black."),
+            ),
+        ],
+    )
+
+
+def query_map(buffers: Buffers) -> Picture:
+    evaluations = buffers.trace.evaluations.float()
+    return shading.error_picture(evaluations.masked_fill(evaluations == 0, float("nan")), MOST_QUERIES)
+
+
+def error_map(buffers: Buffers, truth: np.ndarray) -> Picture:
+    depth = buffers.depth.detach().cpu().numpy()
+    seen = np.isfinite(depth) & np.isfinite(truth)
+    picture = shading.error_picture(np.where(seen, depth - np.where(seen, truth, 0), np.nan), LARGEST_ERROR)
+    picture[np.isfinite(depth) != np.isfinite(truth)] = 0
+    return picture
+
+
+def fields_page(rows: Sequence[FieldRow]) -> str:
+    """Which pixels strategies get wrong on fields that are not what sphere tracing assumes."""
+    names = list(dict.fromkeys(row.strategy for row in rows))
+    by_field = {row.field: {} for row in rows}
+    for line in rows:
+        by_field[line.field][line.strategy] = f"{line.wrong - line.admitted} + {line.admitted}"
+    visible = {row.field: row.visible for row in rows}
+    cells = [[field, f"{visible[field]}", *(by[name] for name in names)] for field, by in by_field.items()]
+    lead = "Pixels that are wrong (hit or not, or depth by more than a thousandth): unnoticed + said to be EXHAUSTED."
+    return page(
+        "Fields that break the assumption", lead, [section("Wrong pixels", table(["field", "visible", *names], cells))]
+    )
+
+
+def growth_page(rows: Sequence[GrowthRow], memory: dict[int, float]) -> str:
+    """Queries and time as images, networks and the number of views grow."""
+    parts: list[Html] = []
+    for axis in dict.fromkeys(row.axis for row in rows):
+        some = [row for row in rows if row.axis == axis]
+        parts.append(section(axis.capitalize(), table(*_cells(some)), *(_charts(some) if axis != "network" else ())))
+    lines = [[f"{size}²", f"{mib:.0f}"] for size, mib in memory.items()]
+    parts.append(section("Memory", table(["pixels", "MiB beyond the weights"], lines)))
+    return page("How the cost grows", "The poster's view; 256 × 256 pixels where views or networks are counted.", parts)
+
+
+def _charts(rows: Sequence[GrowthRow]) -> list[Html]:
+    names = dict.fromkeys(row.strategy for row in rows)
+    series = [
+        {name: {float(row.value): getattr(row, key) for row in rows if row.strategy == name} for name in names}
+        for key in ("queries", "seconds")
+    ]
+    return [growth(lines, rows[0].axis, label) for lines, label in zip(series, ("network evaluations", "seconds"))]
+
+
+def _cells(rows: Sequence[Row] | Sequence[GrowthRow]) -> tuple[list[str], list[list[str]]]:
+    """Header and lines; counts with separators, small numbers in as few digits as tell."""
+    lines = [line.asdict() for line in rows]
+    return list(lines[0]), [[short(value) for value in line.values()] for line in lines]
+
+
+def _scale(first: str, last: str, begins: float) -> Html:
+    colours = shading.error_picture(np.linspace(2 * begins - 1, 1, 64)[None], 1.0)
+    return ramp(first, last, colours)
