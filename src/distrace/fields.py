@@ -47,7 +47,7 @@ class Hard:
 def hard_fields(decoder: SDF, camera: Camera) -> Mapping[str, Hard]:
     """By name; `decoder` is any well-trained one, and a gap is as wide as one pixel of the camera."""
     like = camera.intrinsics
-    pixel = float(2 * camera.tolerance(1.0).min() * camera.T_world_camera[:3, 3].norm())
+    pixel = float(2 * camera.tolerance(1.0).max() * camera.T_world_camera[:3, 3].norm())
     return {
         "decoder × 2": Hard(lambda points: 2 * decoder(points), 2.5),
         "thin plate": Hard(box(like.new_tensor([0.6, THICKNESS / 2, 0.4])), 1.0),

@@ -17,9 +17,17 @@ SEARCHES = 3  # places on a ray that are looked at because the surface is but ne
 
 
 def trace_coarsest(picture: Picture) -> None:
-    """Approaches the surface on every ray of the first stride: what is thin in all directions but two is found."""
+    """Approaches the surface on every ray of the first stride, so that nothing that is thin both ways of it is passed.
+
+    Where a last trace hit, its distance is tried before.
+    """
     pixels = picture.grid.between(picture.config.strides[0], True, picture.near.device)
     pixels = pixels[picture.meets[pixels]]
+    last, slope = picture.last_distance[pixels], picture.last_slope[pixels]
+    again = last.isfinite() & (slope < -STEEP)
+    doubt = torch.full_like(last, PARENTS_DOUBT)
+    picture.settle(pixels[again], Guess(last, slope, doubt)[again])
+    pixels = pixels[~picture.hit[pixels]]
     ahead = forecast(picture.lattice, picture.rays[pixels], picture.begin[pixels], picture.end[pixels])
     picture.closest[pixels] = ahead.closest
     met = torch.isfinite(ahead.begins)

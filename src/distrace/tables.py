@@ -69,7 +69,7 @@ def fields_page(rows: Sequence[FieldRow]) -> str:
     for line in rows:
         by_field[line.field][line.strategy] = f"{line.wrong - line.admitted} + {line.admitted}"
     visible = {row.field: row.visible for row in rows}
-    cells = [[field, f"{visible[field]}", *(by[name] for name in names)] for field, by in by_field.items()]
+    cells = [[field, f"{visible[field]}", *(by.get(name, "–") for name in names)] for field, by in by_field.items()]
     lead = "Pixels that are wrong (hit or not, or depth by more than a thousandth): unnoticed + said to be EXHAUSTED."
     return page(
         "Fields that break the assumption", lead, [section("Wrong pixels", table(["field", "visible", *names], cells))]

@@ -1,0 +1,48 @@
+"""How cost grows: the rows of the table."""
+
+import pytest
+import torch
+
+from distrace import growth
+from distrace.bench import poster_view, reference_distance
+from distrace.primitives import sphere
+from distrace.rays import meet_sphere
+from distrace.tables import growth_page
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "SIZES", (16, 32))
+    monkeypatch.setattr(growth, "NETWORKS", ((2, 16), (3, 16)))
+    monkeypatch.setattr(growth, "VIEWS", (1, 3))
+
+
+def test_a_row_for_every_size_strategy_network_and_number_of_views() -> None:
+    rows = [*growth.by_size(sphere(0.5), 1), *growth.by_network(1), *growth.by_views(sphere(0.5), 1)]
+    assert [row.value for row in rows] == ["16", "16", "32", "32", "2 × 16", "2 × 16", "3 × 16", "3 × 16", "1", "3"]
+    assert all(row.per_pixel == row.queries / row.visible for row in rows)
+    text = growth_page(rows, {64: 12.3})
+    assert "3 × 16" in text
+    assert "64²" in text
+
+
+def test_more_pixels_cost_more_and_each_of_them_less() -> None:
+    small, large = (row for row in growth.by_size(sphere(0.5), 1) if row.strategy == "fast")
+    assert small.queries < large.queries
+    assert small.per_pixel > large.per_pixel
+
+
+def test_views_share_one_lattice() -> None:
+    one, three = growth.by_views(sphere(0.5), 1)
+    assert three.visible > 2.9 * one.visible
+    assert three.queries < 3 * one.queries
+
+
+@pytest.mark.parametrize(("layers", "width"), [(4, 128), (8, 256)])
+def test_an_untrained_network_is_about_a_sphere(layers: int, width: int) -> None:
+    rays = poster_view(16).rays()
+    with torch.no_grad():
+        found = reference_distance(growth.ball(layers, width), rays, meet_sphere(rays))
+    hit = torch.isfinite(found)
+    assert hit.sum() > 10
+    assert rays.at(found)[hit].norm(dim=-1).mean() == pytest.approx(growth.RADIUS, rel=0.5)
