@@ -14,7 +14,7 @@ from distrace.page import row as beside
 from distrace.render import Buffers
 from distrace.shading import Picture
 
-MAPPED = ("coarse_to_fine", "original", "fast", "fast_next")
+MAPPED = ("coarse_to_fine", "fast", "fast_next")
 MOST_QUERIES, LARGEST_ERROR = 20.0, 1e-3
 
 
@@ -98,7 +98,7 @@ def _charts(rows: Sequence[GrowthRow]) -> list[Html]:
 
 def _cells(rows: Sequence[Row] | Sequence[GrowthRow]) -> tuple[list[str], list[list[str]]]:
     """Header and lines; counts with separators, small numbers in as few digits as tell."""
-    lines = [line.asdict() for line in rows]
+    lines = [{key: value for key, value in line.asdict().items() if key != "share"} for line in rows]
     return list(lines[0]), [[short(value) for value in line.values()] for line in lines]
 
 
