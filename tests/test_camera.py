@@ -122,6 +122,50 @@ def test_a_resized_camera_sees_the_same_and_covers_every_pixel(camera: Camera, f
     torch.testing.assert_close(there.origins, camera.rays().origins)
 
 
+@given(orbits, st.integers(0, 8), st.integers(0, 8), st.integers(1, 12), st.integers(1, 12))
+def test_a_cropped_camera_has_the_rays_of_its_part(
+    camera: Camera, top: int, left: int, height: int, width: int
+) -> None:
+    top, left = top % camera.height, left % camera.width
+    part = camera.cropped(top, left, height, width)
+    rays = camera.rays()[top : top + height, left : left + width]
+    assert (part.height, part.width) == rays.shape
+    torch.testing.assert_close(part.rays().directions, rays.directions)
+    torch.testing.assert_close(part.rays().origins, rays.origins)
+    torch.testing.assert_close(part.cosines(), camera.cosines()[top : top + height, left : left + width])
+
+
+@given(orbits, st.floats(0.1, 10), st.floats(0.1, 5))
+def test_a_scaled_camera_sees_a_scaled_world_at_the_same_pixels(camera: Camera, factor: float, distance: float) -> None:
+    points = camera.rays().at(torch.full((camera.height, camera.width), distance, dtype=f64))
+    pixels, depth = camera.project(points)
+    scaled_pixels, scaled_depth = camera.scaled(factor).project(factor * points)
+    torch.testing.assert_close(scaled_pixels, pixels)
+    torch.testing.assert_close(scaled_depth, factor * depth)
+    torch.testing.assert_close(camera.scaled(factor).rays().directions, camera.rays().directions)
+
+
+def test_cropping_and_scaling_leave_the_camera_as_it_was_and_keep_its_gradients() -> None:
+    camera = Camera(K.clone().requires_grad_(), T.clone().requires_grad_(), 64, 64)
+    part = camera.cropped(3, 5, 8, 8).scaled(2.0)
+    torch.testing.assert_close((camera.intrinsics, camera.T_world_camera), (K, T))
+    by_both = torch.autograd.grad(
+        part.intrinsics.sum() + part.T_world_camera.sum(), (camera.intrinsics, camera.T_world_camera)
+    )
+    moved = torch.ones(4, 4)
+    moved[:3, 3] = 2
+    torch.testing.assert_close(by_both, (torch.ones(3, 3), moved))
+
+
+def test_a_detached_camera_has_the_same_rays_without_gradients() -> None:
+    camera = Camera(K.clone().requires_grad_(), T.clone().requires_grad_(), 4, 4)
+    assert camera.rays().directions.requires_grad
+    detached = camera.detach().rays()
+    assert not detached.directions.requires_grad
+    assert not detached.origins.requires_grad
+    torch.testing.assert_close(detached.directions, camera.rays().directions.detach())
+
+
 def test_cameras_in_a_batch_have_the_rays_of_each() -> None:
     alone = [Camera.orbit(a, 10, 3 + a / 90, height=4, width=6, focal_mm=30 + a, dtype=f64) for a in (0, 45, 200)]
     batch = Camera.from_matrices(
@@ -133,7 +177,14 @@ def test_cameras_in_a_batch_have_the_rays_of_each() -> None:
         torch.testing.assert_close(batch.rays().origins[k], camera.rays().origins)
         torch.testing.assert_close(batch.cosines()[k], camera.cosines())
         torch.testing.assert_close(batch.tolerance(0.1)[k], camera.tolerance(0.1))
-        torch.testing.assert_close(batch.resized(0.5).rays().directions[k], camera.resized(0.5).rays().directions)
+        for changed in (
+            Camera.detach,
+            lambda c: c.resized(0.5),
+            lambda c: c.cropped(1, 2, 2, 3),
+            lambda c: c.scaled(2.0),
+        ):
+            torch.testing.assert_close(changed(batch).rays().directions[k], changed(camera).rays().directions)
+            torch.testing.assert_close(changed(batch).rays().origins[k], changed(camera).rays().origins)
 
 
 def test_a_focal_length_in_pixels_is_the_one_in_millimetres() -> None:

@@ -220,7 +220,7 @@ def test_complete_in_a_few_iterations_still_ends_with_a_code(
 
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
     run("bench", "trace", model, "--code", 1, "--size", 24, "--out", tmp_path)
-    assert names(tmp_path) == {"result.json", "evaluations.png"}
+    assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}
     facts = result(tmp_path, "rows", "command", "machine", "evaluations")
     assert facts["command"].startswith("distrace bench trace")
     columns = {"model", "strategy", "queries", "setup_queries", "seconds", "hits", "iou", "outliers"}

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torch.func import functional_call
 
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.field import chunked
 
 torch.set_num_threads(1)
@@ -160,6 +160,89 @@ def test_dropout_acts_in_training_alone(points):
     torch.testing.assert_close(decoder(points, code), decoder(points, code), rtol=0, atol=0)
     decoder.train()
     assert not torch.equal(decoder(points, code), decoder(points, code))
+
+
+def units(field: ShapeField) -> list[int]:
+    return [len(bias) for _, bias in field.layers]
+
+
+def a_place(points: torch.Tensor) -> torch.Tensor:
+    """All points within a small cube."""
+    return 0.05 * points + torch.tensor([0.4, -0.3, 0.2], dtype=torch.float64)
+
+
+def test_a_narrowed_field_has_the_same_values_at_its_points(decoder, points):
+    field, here = decoder.field(a_code(decoder)), a_place(points)
+    values, narrow = field.narrowed(here)
+    torch.testing.assert_close(values, field(here).detach(), rtol=0, atol=0)
+    torch.testing.assert_close(narrow(here), values, rtol=0, atol=1e-12)
+
+
+def test_a_narrowed_field_has_never_more_units(decoder, points):
+    field = decoder.field(a_code(decoder))
+    _, narrow = field.narrowed(points)
+    assert all(few <= many for few, many in zip(units(narrow), units(field), strict=True))
+    assert units(narrow)[-1] == 1
+
+
+def wide() -> tuple[Decoder, ShapeField]:
+    decoder = randomised(NetworkSpecs(dims=(96,) * 4, code_length=5, latent_in=(2,), norm_layers=(0, 1, 2, 3)))
+    return decoder, decoder.field(a_code(decoder))
+
+
+def test_around_a_small_place_many_units_are_off(points):
+    _, field = wide()
+    _, narrow = field.narrowed(a_place(points))
+    assert sum(units(narrow)) < 0.75 * sum(units(field))
+    assert all(width % 16 == 0 for width in units(narrow)[:-1])
+
+
+def test_near_its_points_a_narrowed_field_is_the_same_up_to_units_just_switched_on(points):
+    _, field = wide()
+    _, narrow = field.narrowed(a_place(points))
+    beside = a_place(points.flip(-1))
+    torch.testing.assert_close(narrow(beside), field(beside), rtol=0, atol=1e-3)
+    assert (narrow(beside) - field(beside)).abs().mean() < 1e-5
+
+
+def test_a_narrowed_field_may_be_narrowed_again(points):
+    _, field = wide()
+    _, narrow = field.narrowed(points)
+    values, narrower = narrow.narrowed(a_place(points))
+    assert sum(units(narrower)) < sum(units(narrow))
+    torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(narrower(a_place(points)), values, rtol=0, atol=1e-12)
+
+
+def test_points_of_many_chunks_are_narrowed_together(monkeypatch, points):
+    decoder, _ = wide()
+    monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+    field = decoder.field(a_code(decoder))
+    values, narrow = field.narrowed(a_place(points))
+    torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
+    torch.testing.assert_close(narrow(a_place(points)), values, rtol=0, atol=1e-12)
+
+
+def test_layer_norms_need_all_units(points):
+    decoder = randomised(ARCHITECTURES["layer norm"])
+    field = decoder.field(a_code(decoder))
+    values, same = field.narrowed(points)
+    assert same is field
+    torch.testing.assert_close(values, field(points).detach())
+
+
+def test_in_training_and_without_points_a_field_stays_as_it_is(points):
+    decoder, field = wide()
+    assert field.narrowed(points[:0])[1] is field
+    assert field.narrowed(points[:0])[0].shape == (0,)
+    decoder.train()
+    assert field.narrowed(points)[1] is field
+
+
+def test_values_where_a_field_is_narrowed_carry_no_gradient(points):
+    _, field = wide()
+    assert field(points).requires_grad
+    assert not field.narrowed(points)[0].requires_grad
 
 
 def test_a_code_of_another_length_is_named():

@@ -107,7 +107,7 @@ def test_a_ray_that_passes_clearly_meets_nothing(name: str) -> None:
 @given(st.sampled_from(sorted(SHAPES)), st.integers(0, 1000), st.floats(0.1, 0.9))
 def test_the_surface_does_not_begin_behind_the_first_hit(name: str, seed: int, reach: float) -> None:
     """But for the shortest step: an eighth of a cell."""
-    lattice, rays = LATTICES[name], random_rays(seed, 400, reach)
+    lattice, rays = LATTICES[name], random_rays(seed, 200, reach)
     true = reference_distance(SHAPES[name], rays, meet_sphere(rays))
     hit = torch.isfinite(true)
     foretold = ahead(lattice, rays)
@@ -122,7 +122,7 @@ def test_the_surface_of_any_ball_does_not_begin_behind_the_first_hit(radius: flo
     true = meet_sphere(Rays(rays.origins - centre, rays.directions), radius)
     foretold = ahead(lattice, rays)
     assert (foretold.kind[true.meets] != Kind.NOTHING).all()
-    assert (foretold.begins - true.near)[true.meets].max() <= lattice.cell / 8
+    assert (foretold.begins <= true.near + lattice.cell / 8)[true.meets].all()
 
 
 @every_shape

@@ -341,6 +341,56 @@ def test_without_polish_a_hit_is_a_sample() -> None:
     assert (trace(watched, rays).distance - true).abs() < 1e-7
 
 
+def nearly_touching(clearance: float) -> tuple[primitives.SDF, Rays]:
+    """A ray that passes a small ball on its way to a wall at a distance of 3."""
+    ball = primitives.sphere(0.1, torch.tensor([0, 0.1 + clearance, 0.5], dtype=f64))
+    wall = primitives.plane(torch.tensor([0, 0, 1], dtype=f64))
+    return primitives.union(ball, wall), ray([0, 0, 3], [0, 0, -1])
+
+
+def test_with_a_least_step_a_ray_that_nearly_touches_goes_on_to_what_is_behind() -> None:
+    """Where f falls to 1e-5 its steps would be as short, and run out."""
+    sdf, rays = nearly_touching(1e-5)
+    cautious = replace(AGGRESSIVE, steps=100, tolerance=2e-6)
+    assert trace(sdf, rays, cautious).outcome.item() == Outcome.EXHAUSTED
+    passing = trace(sdf, rays, replace(cautious, least_step=6e-4))
+    assert passing.outcome.item() == Outcome.HIT
+    assert passing.distance.item() == pytest.approx(3, abs=1e-6)
+
+
+def test_a_least_step_is_kept_outside_and_not_in_the_solid() -> None:
+    watched = Watched(primitives.plane(torch.tensor([0, 0, 1], dtype=f64)))
+    start = torch.tensor([2.9999], dtype=f64)
+    config = replace(DYNAMIC, tolerance=1e-9, least_step=1e-3)
+    traced = trace(watched, ray([0, 0, 3], [0, 0, -1]), config, start)
+    asked = 3 - torch.cat(watched.asked)[:, 2]
+    assert asked[:2].tolist() == pytest.approx([2.9999, 3.0009])
+    assert (asked[1:].diff().abs() < 1e-3).all()
+    assert traced.distance.item() == pytest.approx(3, abs=1e-9)
+
+
+def test_a_trace_is_indexed_as_its_images_are() -> None:
+    whole = replace(trace(scene, view().rays()), slope=torch.rand(24, 24), setup_evaluations=7)
+    for index in ((slice(3, 9), slice(None, None, 2)), whole.hit, (5, 7), (..., slice(4, 6))):
+        part = whole[index]
+        assert part.setup_evaluations == 7
+        for name, image in whole.images().items():
+            torch.testing.assert_close(getattr(part, name), image[index], equal_nan=True)
+    assert set(whole.images()) == {"distance", "outcome", "closest", "stopped", "evaluations", "slope"}
+    assert whole[(slice(4), slice(6))].reshaped(torch.Size([24])).slope.shape == (24,)
+
+
+def test_a_scaled_trace_has_scaled_lengths_and_slopes_and_the_same_rest() -> None:
+    whole = replace(trace(scene, view().rays()), slope=torch.rand(24, 24))
+    scaled = whole.scaled(2.0, 3.0)
+    for name in ("distance", "closest", "stopped"):
+        torch.testing.assert_close(getattr(scaled, name), 2 * getattr(whole, name))
+    torch.testing.assert_close(scaled.slope, 3 * whole.slope)
+    assert (scaled.hit == whole.hit).all()
+    assert scaled.total_evaluations == whole.total_evaluations
+    assert trace(scene, view().rays()).scaled(2.0).slope is None
+
+
 def test_a_trace_carries_no_gradient() -> None:
     radius = torch.tensor(0.5, requires_grad=True)
     camera = Camera.orbit(30, 20, 4.97, height=8, width=8)

@@ -76,14 +76,12 @@ def fields_page(rows: Sequence[FieldRow]) -> str:
     )
 
 
-def growth_page(rows: Sequence[GrowthRow], memory: dict[int, float]) -> str:
+def growth_page(rows: Sequence[GrowthRow]) -> str:
     """Queries and time as images, networks and the number of views grow."""
     parts: list[Html] = []
     for axis in dict.fromkeys(row.axis for row in rows):
         some = [row for row in rows if row.axis == axis]
         parts.append(section(axis.capitalize(), table(*_cells(some)), *(_charts(some) if axis != "network" else ())))
-    lines = [[f"{size}²", f"{mib:.0f}"] for size, mib in memory.items()]
-    parts.append(section("Memory", table(["pixels", "MiB beyond the weights"], lines)))
     return page("How the cost grows", "The poster's view; 256 × 256 pixels where views or networks are counted.", parts)
 
 

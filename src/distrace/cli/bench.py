@@ -29,9 +29,9 @@ SHORT: dict[str, str] = {
 class Bench:
     """Measure what tracing costs and how far it is off, against a reference that takes no chances."""
 
-    what: tyro.conf.Positional[Literal["trace", "fields", "growth"]]
+    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory"]]
     """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
-    with the size of the image, of the network and the number of views"""
+    with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels"""
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
@@ -42,7 +42,7 @@ class Bench:
     def run(self) -> None:
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
-        {"trace": self._trace, "fields": self._fields, "growth": self._growth}[self.what](run, model)
+        getattr(self, f"_{self.what}")(run, model)
 
     def _trace(self, run: Run, model: Model) -> None:
         camera, cases = poster_view(self.size).to(run.device), []
@@ -79,12 +79,21 @@ class Bench:
                 for row in axis:
                     rows.append(row)
                     bar.advance(f"{row.axis} {row.value}, {row.strategy}: {row.seconds:.2f} s")
-        memory = {size: growth.peak_memory(self.model, self.code, size) for size in growth.MEASURED}
-        save_text(run.out / "index.html", tables.growth_page(rows, memory))
-        recorded = [{"model": self.model, **row.asdict()} for row in rows]
-        _finish(run, recorded, memory_mib={str(size): mib for size, mib in memory.items()})
+        save_text(run.out / "index.html", tables.growth_page(rows))
+        _finish(run, [{"model": self.model, **row.asdict()} for row in rows])
+
+    def _memory(self, run: Run, _: Model) -> None:
+        rows = []
+        with progress("memory", len(growth.MEASURED)) as bar:
+            for size in growth.MEASURED:
+                rows.append(
+                    {"model": self.model, "pixels": size, "mib": growth.peak_memory(self.model, self.code, size)}
+                )
+                bar.advance(f"{size} × {size}: {rows[-1]['mib']:.0f} MiB")
+        show_table(rows)
+        run.finish({"rows": rows, **origin()})
 
 
-def _finish(run: Run, rows: list[dict[str, Any]], **more: object) -> None:
+def _finish(run: Run, rows: list[dict[str, Any]]) -> None:
     show_table([{SHORT.get(key, key): value for key, value in row.items() if key not in HIDDEN} for row in rows])
-    run.finish({"rows": rows, **more, **origin(), "evaluations": sum(row["queries"] for row in rows)})
+    run.finish({"rows": rows, **origin(), "evaluations": sum(row["queries"] for row in rows)})
