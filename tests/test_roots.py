@@ -129,6 +129,12 @@ def test_a_root_beyond_reach_is_not_found() -> None:
     assert rows.settle(far).distance.isnan().all()
 
 
+def test_a_slope_too_flat_throws_no_ray_out_of_its_reach() -> None:
+    """A step is half the reach at most; it would be 1.2 times that."""
+    roots = Rows(line(-1.0), ROOT).settle(guess(ROOT - 0.6 * REACH, -0.5, 1.0))
+    torch.testing.assert_close(roots.distance, ROOT, rtol=0, atol=1e-12)
+
+
 def test_no_ray_is_looked_at_beyond_its_reach() -> None:
     rows = Rows(lambda t, root: torch.full_like(t, 0.5), ROOT)
     start = ROOT + 0.3
