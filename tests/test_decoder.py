@@ -197,6 +197,14 @@ def test_around_a_small_place_many_units_are_off(points):
     assert all(width % 16 == 0 for width in units(narrow)[:-1])
 
 
+@pytest.mark.parametrize("size", [0.1, 0.3, 0.6, 1.0])
+def test_no_unit_is_lost_that_is_on_at_any_of_the_points(size, points):
+    _, field = wide()
+    values, narrow = field.narrowed(size * points)
+    assert sum(units(narrow)) < sum(units(field))
+    torch.testing.assert_close(narrow(size * points), values, rtol=0, atol=1e-12)
+
+
 def test_near_its_points_a_narrowed_field_is_the_same_up_to_units_just_switched_on(points):
     _, field = wide()
     _, narrow = field.narrowed(a_place(points))

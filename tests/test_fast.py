@@ -175,6 +175,9 @@ def test_tiles_show_what_the_whole_shows(monkeypatch: pytest.MonkeyPatch) -> Non
     assert {image.shape for image in tiles.images().values()} == {torch.Size([2, 40, 30])}
     assert_same_image(tiles, whole, 2 * TOLERANCE, other_pixels=4)
     assert (tiles.distance.isfinite() == tiles.hit).all()
+    again = traced(BOX, cameras, last=tiles)
+    assert_same_image(again, tiles, 2 * TOLERANCE, other_pixels=4)
+    assert again.evaluations.sum() < 0.9 * tiles.evaluations.sum()
 
 
 def test_a_lattice_from_the_view_before_saves_its_setup_and_changes_nothing(first: tuple[Trace, Lattice]) -> None:
@@ -371,6 +374,27 @@ def test_the_field_is_asked_without_gradients_alone() -> None:
     assert trace.hit.any()
     assert not any(image.requires_grad for image in trace.images().values())
     assert not lattice.values.requires_grad
+
+
+class Narrowing(Counted):
+    """A field that is another object where it is narrowed; both count."""
+
+    def __init__(self, sdf: SDF) -> None:
+        super().__init__(sdf)
+        self.near = Counted(sdf)
+
+    def narrowed(self, points: Tensor) -> tuple[Tensor, SDF]:
+        return self(points), self.near
+
+
+def test_rays_ask_the_narrowed_field_alone() -> None:
+    field = Narrowing(BALL)
+    trace, lattice = fast_trace(field, view(16))
+    assert field.evaluations == trace.setup_evaluations
+    assert field.near.evaluations == trace.evaluations.sum() > 0
+    another = Counted(BALL)
+    fast_trace(another, view(16), lattice=lattice)
+    assert another.evaluations == trace.evaluations.sum()
 
 
 def test_a_decoder_shows_what_it_shows_as_a_plain_function(decoded: tuple[ShapeField, Trace, Lattice]) -> None:

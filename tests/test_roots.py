@@ -122,6 +122,12 @@ def test_where_a_ray_but_touches_there_is_no_root(slope: float, clearance: float
     assert roots.evaluations.max() <= 7
 
 
+def test_on_a_flat_slope_a_small_value_is_no_root_without_a_change_of_sign() -> None:
+    for slope, found in ((-0.2, True), (-0.1, False)):
+        roots = Rows(lambda t, root: torch.full_like(t, 1e-5), ROOT).settle(guess(ROOT, slope, 0.03))
+        assert (roots.distance.isfinite() == found).all()
+
+
 def test_a_root_beyond_reach_is_not_found() -> None:
     rows = Rows(line(-1.0), ROOT)
     near, far = guess(ROOT - 0.9 * REACH, -1.0, 0.03), guess(ROOT - 1.6 * REACH, -1.0, 0.03)
