@@ -146,7 +146,8 @@ class ShapeField:
 
         values = torch.cat([self.decoder._run(self.layers, part, watch) for part in points.split(self.size)])
         kept = [_on(*both) for both in zip(highest, deviation, strict=True)]
-        return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
+        with torch.enable_grad():  # what surfaces are attached to is as differentiable as the whole
+            return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
 
     def _thinned(self, layer: int, kept: list[Tensor]) -> Layer:
         """A layer without the rows of its own units that are off, and without the columns of those before."""

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from distrace import pyramid, surface
 from distrace.camera import Camera
-from distrace.fast import fast_trace
+from distrace.fast import fast_trace, near_surface
 from distrace.field import SDF
 from distrace.lattice import Lattice
 from distrace.picture import FastConfig
@@ -52,13 +52,18 @@ class Buffers:
     def mask(self) -> Bool[Tensor, "*batch"]:
         return self.trace.hit
 
+    @property
+    def near(self) -> SDF:
+        """The field, cheaper where there are hits if the tracer has learnt how."""
+        return near_surface(self.sdf, self.lattice)
+
     @_kept
     def distance(self) -> Float[Tensor, "*batch"]:
         """Along the ray; `inf` where nothing was hit."""
         hit = self.trace.hit
         if not torch.is_grad_enabled():
             return self.trace.distance
-        attached = surface.attach(self.sdf, self.rays[hit], self.trace.distance[hit])
+        attached = surface.attach(self.near, self.rays[hit], self.trace.distance[hit])
         return self.trace.distance.masked_scatter(hit, attached)
 
     @_kept
@@ -79,7 +84,7 @@ class Buffers:
         """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
         hit = self.trace.hit[..., None].expand(*self.trace.hit.shape, 3)
         empty = torch.zeros_like(self.rays.directions)
-        return empty.masked_scatter(hit, surface.normals(self.sdf, self.points))
+        return empty.masked_scatter(hit, surface.normals(self.near, self.points))
 
     @_kept
     def clearance(self) -> Float[Tensor, "*batch"]:

@@ -6,11 +6,13 @@ Each takes the field and the rays with whatever requires grad in them, and the r
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils.checkpoint import checkpoint
 
 from distrace.field import SDF, value_and_gradient
 from distrace.rays import Bounds, Rays
 
 LEAST_SLOPE = 1e-6  # a ray along the surface has no derivative of its distance
+PART = 1 << 17  # points whose graph is kept: at 8 × 512 about 2 GiB
 WALK = 20  # rounds downhill: across the unit sphere at a `reach` of 0.1
 
 
@@ -21,14 +23,33 @@ def attach(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> Float[Ten
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
     surface tangentially (|∇f · v| < 1e-6) there is no derivative, and none is given.
     """
-    distance = distance.detach()
-    points = rays.at(distance)
-    if not _differentiable(sdf, points):
+    distance, fixed = distance.detach(), rays.detach()
+    points = fixed.at(distance)
+    moves = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
+    changes = _differentiable(sdf, points)
+    if not (moves or changes):
         return distance
-    value, gradient = value_and_gradient(sdf, points, second_order=False)
-    slope = (gradient * rays.directions.detach()).sum(-1)
+    value, gradient = _linearised(sdf, points, changes)
+    slope = (gradient * fixed.directions).sum(-1)
+    change = value - value.detach()
+    if moves:
+        change = change + (gradient * (rays.at(distance) - points)).sum(-1)
     flat = slope.abs() < LEAST_SLOPE
-    return distance - torch.where(flat, 0.0, (value - value.detach()) / torch.where(flat, 1.0, slope))
+    return distance - torch.where(flat, 0.0, change / torch.where(flat, 1.0, slope))
+
+
+def _linearised(sdf: SDF, points: Float[Tensor, "*batch 3"], changes: bool) -> tuple[Tensor, Float[Tensor, "*batch 3"]]:
+    """Value and gradient, the latter a constant; the value is differentiable in the field if that `changes`.
+
+    Of many points the value's graph is made again when it is needed: a bound on memory, at one more evaluation.
+    """
+    parts = points.reshape(-1, 3).split(PART)
+    with torch.set_grad_enabled(changes and len(parts) <= 1):
+        pairs = [value_and_gradient(sdf, part, second_order=False) for part in parts]
+    values, gradients = (torch.cat(part) for part in zip(*pairs))
+    if changes and len(parts) > 1:
+        values = torch.cat([checkpoint(sdf, part, use_reentrant=False) for part in parts])
+    return values.reshape(points.shape[:-1]), gradients.reshape(points.shape)
 
 
 def normals(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
