@@ -1,5 +1,6 @@
 """A differentiable renderer for neural signed distance functions, by sphere tracing."""
 
+from distrace.boundary import shade as shade
 from distrace.camera import Camera as Camera
 from distrace.checkpoint import Model as Model
 from distrace.checkpoint import load_model as load_model
@@ -11,11 +12,14 @@ from distrace.field import placed as placed
 from distrace.fit import FitConfig as FitConfig
 from distrace.fit import fit_shape as fit_shape
 from distrace.fit import prior_of as prior_of
+from distrace.gradcheck import GradientCheck as GradientCheck
+from distrace.gradcheck import check_gradients as check_gradients
 from distrace.lattice import Lattice as Lattice
 from distrace.lattice import LatticeConfig as LatticeConfig
 from distrace.mesh import MeshConfig as MeshConfig
 from distrace.mesh import extract_mesh as extract_mesh
 from distrace.metrics import chamfer as chamfer
+from distrace.moves import decoder_changes as decoder_changes
 from distrace.rays import Bounds as Bounds
 from distrace.rays import Rays as Rays
 from distrace.rays import meet_sphere as meet_sphere

@@ -38,7 +38,7 @@ def fast_trace(
     """
     setup = 0
     if lattice is None:
-        lattice, setup = _prepared(sdf, camera.intrinsics.detach(), radius, config)
+        lattice, setup = prepared(sdf, camera.intrinsics.detach(), radius, config)
     elif lattice.radius != radius:
         raise ValueError(
             f"a lattice for a radius of {lattice.radius} was given with a radius of {radius}; leave it out"
@@ -56,8 +56,13 @@ def near_surface(sdf: SDF, lattice: Lattice | None) -> SDF:
     return lattice.near.sdf if isinstance(lattice.near, _Unit) else lattice.near
 
 
-def _prepared(sdf: SDF, like: Tensor, radius: float, config: FastConfig) -> tuple[Lattice, int]:
-    """A lattice of the field; where that turns out to be too steep, one of the field divided by its steepness."""
+@torch.no_grad()
+def prepared(
+    sdf: SDF, like: Tensor, radius: float = 1.0, config: FastConfig = FastConfig()
+) -> tuple[Lattice, int]:
+    """A lattice of the field; where that turns out to be too steep, one of the field divided by its steepness.
+
+    And how many evaluations both took."""
     lattice = build(_unit(sdf, radius, 1.0), config.lattice, like)
     evaluations, steepness = lattice.evaluations, lattice.measured_steepness()
     if steepness > config.lattice.steepest:

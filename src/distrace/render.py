@@ -97,7 +97,7 @@ class Buffers:
             missing = rays[~hit].detach()
             lowest = surface.minimum(self.sdf, missing, closest[~hit], meet_sphere(missing, self.radius))
             closest = closest.masked_scatter(~hit, lowest)
-        return least.masked_scatter(met, self.sdf(rays.at(closest)))
+        return least.masked_scatter(met, surface.least(self.sdf, rays, closest))
 
 
 def render(

@@ -23,19 +23,27 @@ def attach(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> Float[Ten
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
     surface tangentially (|∇f · v| < 1e-6) there is no derivative, and none is given.
     """
-    distance, fixed = distance.detach(), rays.detach()
-    points = fixed.at(distance)
-    moves = torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
-    changes = _differentiable(sdf, points)
-    if not (moves or changes):
+    distance = distance.detach()
+    if not (_moves(rays) or _differentiable(sdf, rays.detach().at(distance))):
         return distance
-    value, gradient = _linearised(sdf, points, changes)
-    slope = (gradient * fixed.directions).sum(-1)
-    change = value - value.detach()
-    if moves:
-        change = change + (gradient * (rays.at(distance) - points)).sum(-1)
+    change, slope = _change(sdf, rays, distance)
     flat = slope.abs() < LEAST_SLOPE
     return distance - torch.where(flat, 0.0, change / torch.where(flat, 1.0, slope))
+
+
+def _change(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
+    """A zero that changes as f does at fixed distances along the rays; and the slope ∇f · v there, a constant."""
+    fixed = rays.detach()
+    points = fixed.at(distance)
+    value, gradient = _linearised(sdf, points, _differentiable(sdf, points))
+    change = value - value.detach()
+    if _moves(rays):
+        change = change + (gradient * (rays.at(distance) - points)).sum(-1)
+    return change, (gradient * fixed.directions).sum(-1)
+
+
+def _moves(rays: Rays) -> bool:
+    return torch.is_grad_enabled() and (rays.origins.requires_grad or rays.directions.requires_grad)
 
 
 def _linearised(sdf: SDF, points: Float[Tensor, "*batch 3"], changes: bool) -> tuple[Tensor, Float[Tensor, "*batch 3"]]:
@@ -66,14 +74,42 @@ def clearance(
     bounds: Bounds | None = None,
     *,
     reach: float = 0.1,
-    refine: int = 3,
+    refine: int | None = None,
 ) -> Float[Tensor, "*batch"]:
     """The least value of f on rays that miss, differentiable in the field and the ray; `closest` is the trace's sample.
 
     The march samples a ray no closer than its steps, so its least sample is not the minimum, and the gradient at it
-    would lie. At the minimum df/dt = 0, so its derivative is the field's own at a fixed point (the envelope theorem).
+    would lie.
     """
-    return sdf(rays.at(minimum(sdf, rays.detach(), closest.detach(), bounds, reach=reach, refine=refine)))
+    lowest = minimum(sdf, rays.detach(), closest.detach(), bounds, reach=reach, refine=refine)
+    return least(sdf, rays, lowest, reach=reach, refine=refine)
+
+
+def least(
+    sdf: SDF, rays: Rays, lowest: Float[Tensor, "*batch"], *, reach: float = 0.1, refine: int | None = None
+) -> Float[Tensor, "*batch"]:
+    """The value at a minimum along the ray, with its exact derivative.
+
+    Where f is smooth that is the field's own at the fixed point, for df/dt = 0 (the envelope theorem). Where a corner of
+    f lies on the ray, as every minimum of a ReLU network's is, it is the mean of both sides whose slope along the ray
+    vanishes; one look to each side serves both.
+    """
+    with torch.no_grad():
+        value = sdf(rays.at(lowest))
+    if not (_moves(rays) or _differentiable(sdf, rays.detach().at(lowest))):
+        return value
+    beside = 2 * reach / 5 ** _rounds(lowest, refine)
+    sides = torch.stack([lowest - beside, lowest + beside])
+    both = Rays(rays.origins.expand(2, *rays.origins.shape), rays.directions.expand(2, *rays.directions.shape))
+    change, (falling, rising) = _change(sdf, both, sides)
+    corner = (falling < 0) & (rising > 0)
+    share = torch.where(corner, rising / torch.where(corner, rising - falling, 1.0), 0.5)
+    return value + share * change[0] + (1 - share) * change[1]
+
+
+def _rounds(like: Tensor, refine: int | None) -> int:
+    """Down to where rounding hides which side is lower."""
+    return (8 if like.dtype == torch.float64 else 4) if refine is None else refine
 
 
 @torch.no_grad()
@@ -84,7 +120,7 @@ def minimum(
     bounds: Bounds | None = None,
     *,
     reach: float = 0.1,
-    refine: int = 3,
+    refine: int | None = None,
 ) -> Float[Tensor, "*batch"]:
     """The distance of the local minimum of f beside `closest`, within the bounds: 1 + 3 · refine evaluations and more.
 
@@ -94,9 +130,9 @@ def minimum(
     flat, t = rays.flat(), closest.reshape(-1).clone()
     near = torch.zeros_like(t) if bounds is None else bounds.near.reshape(-1)
     far = torch.full_like(t, torch.inf) if bounds is None else bounds.far.reshape(-1)
-    value, width = sdf(flat.at(t)), torch.full_like(t, reach)
-    for _ in range(refine + WALK):
-        going = (width > 1.5 * reach / 5**refine).nonzero()[:, 0]
+    value, width, rounds = sdf(flat.at(t)), torch.full_like(t, reach), _rounds(t, refine)
+    for _ in range(rounds + WALK):
+        going = (width > 1.5 * reach / 5**rounds).nonzero()[:, 0]
         if not len(going):
             break
         ray, middle, w, lowest, highest = flat[going], t[going], width[going], near[going], far[going]

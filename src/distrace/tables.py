@@ -5,9 +5,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from distrace import shading
+from distrace.backward import Timing
 from distrace.bench import Row
 from distrace.charts import bars, growth
 from distrace.fields import FieldRow
+from distrace.gradients import RatioRow
 from distrace.growth import GrowthRow
 from distrace.page import Html, figure, page, paragraph, ramp, section, short, table
 from distrace.page import row as beside
@@ -16,6 +18,7 @@ from distrace.shading import Picture
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")
 MOST_QUERIES, LARGEST_ERROR = 20.0, 1e-3
+DOUBLINGS, ENLARGED = 3.0, 4  # of the maps of ratios
 
 
 def trace_page(model: str, measured: Sequence[tuple[Row, Buffers]], truths: Sequence[np.ndarray]) -> str:
@@ -85,6 +88,32 @@ def growth_page(rows: Sequence[GrowthRow]) -> str:
     return page("How the cost grows", "The poster's view; 256 × 256 pixels where views or networks are counted.", parts)
 
 
+def gradients_page(rows: Sequence[RatioRow], ratios: Sequence[np.ndarray], timings: Sequence[Timing]) -> str:
+    """How the derivatives of depth relate to finite differences, by each method, and what a backward pass costs."""
+    maps: dict[str, list[Picture]] = {}
+    for row, ratio in zip(rows, ratios, strict=True):
+        maps.setdefault(f"{row.field} by {row.parameter}", []).append(ratio_map(ratio))
+    methods = ", ".join(dict.fromkeys(row.method for row in rows))
+    pictures = [figure(shading.side_by_side(several), f"{name}: {methods}") for name, several in maps.items()]
+    lead = "Derivatives of depth, pixel by pixel, against central differences in float64: exact, and as DIST has them."
+    scale = _scale(f"1 / {2**DOUBLINGS:.0f} or less, or of the wrong sign", f"{2**DOUBLINGS:.0f} times or more", 0.0)
+    return page(
+        "Gradients",
+        lead,
+        [
+            section("Table", table(*_cells(rows))),
+            section("Ratio of derivative to difference", scale, *pictures),
+            section("Time of a depth image and of its gradient", table(*_cells(timings))),
+        ],
+    )
+
+
+def ratio_map(ratio: np.ndarray) -> Picture:
+    """Grey is right, red too large, blue too small; white where there is nothing to compare."""
+    doublings = np.log2(np.where(ratio > 0, ratio, np.where(np.isnan(ratio), np.nan, 2**-DOUBLINGS)))
+    return shading.error_picture(doublings, DOUBLINGS).repeat(ENLARGED, 0).repeat(ENLARGED, 1)
+
+
 def _charts(rows: Sequence[GrowthRow]) -> list[Html]:
     names = dict.fromkeys(row.strategy for row in rows)
     series = [
@@ -94,7 +123,9 @@ def _charts(rows: Sequence[GrowthRow]) -> list[Html]:
     return [growth(lines, rows[0].axis, label) for lines, label in zip(series, ("network evaluations", "seconds"))]
 
 
-def _cells(rows: Sequence[Row] | Sequence[GrowthRow]) -> tuple[list[str], list[list[str]]]:
+def _cells(
+    rows: Sequence[Row] | Sequence[GrowthRow] | Sequence[RatioRow] | Sequence[Timing],
+) -> tuple[list[str], list[list[str]]]:
     """Header and lines; counts with separators, small numbers in as few digits as tell."""
     lines = [{key: value for key, value in line.asdict().items() if key != "share"} for line in rows]
     return list(lines[0]), [[short(value) for value in line.values()] for line in lines]

@@ -40,10 +40,8 @@ class Pool:
         with_depth = view.seen.reshape(-1).nonzero()[:, 0]
         if view.mask is None:
             return Pool(view, with_depth, nothing, nothing)
-        inner = view.mask[None].float()
-        band = max_pool2d(inner, OUTLINE, 1, OUTLINE // 2) != -max_pool2d(-inner, OUTLINE, 1, OUTLINE // 2)
         meets = meet_sphere(view.camera.rays()).meets
-        outline, anywhere = ((region & meets).reshape(-1).nonzero()[:, 0] for region in (band[0], meets))
+        outline, anywhere = ((region & meets).reshape(-1).nonzero()[:, 0] for region in (band(view.mask), meets))
         return Pool(view, with_depth, outline, anywhere)
 
     def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator) -> Targets:
@@ -56,6 +54,12 @@ class Pool:
         normal = None if view.normal is None else view.normal.reshape(-1, 3)[chosen]
         pixels = view.camera.pixels().reshape(-1, 2)[chosen]
         return Targets(view.camera, pixels, view.depth.reshape(-1)[chosen], is_object, normal)
+
+
+def band(mask: Bool[Tensor, "height width"], width: int = OUTLINE) -> Bool[Tensor, "height width"]:
+    """The pixels on both sides of a mask's outline; `width` is odd."""
+    inner = mask[None].float()
+    return (max_pool2d(inner, width, 1, width // 2) != -max_pool2d(-inner, width, 1, width // 2))[0]
 
 
 def _draw(indices: Tensor, count: int, random: torch.Generator) -> Tensor:

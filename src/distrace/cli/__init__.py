@@ -13,6 +13,7 @@ from distrace.cli.complete import Complete, Demo
 from distrace.cli.console import errors
 from distrace.cli.data import Data, Sample
 from distrace.cli.evaluate import Evaluate
+from distrace.cli.gradients import CheckGradients
 from distrace.cli.show import Mesh, Render
 from distrace.cli.train import Train
 
@@ -26,6 +27,7 @@ COMMANDS = {
     "train": Train,
     "bench": Bench,
     "evaluate": Evaluate,
+    "check-gradients": CheckGradients,
 }
 
 ABOUT = "Render neural signed distance functions, and fit them to what was observed. Results go to the folder --out."

@@ -7,7 +7,7 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from distrace import ablation, fields, growth, tables
+from distrace import ablation, backward, fields, gradients, growth, tables
 from distrace.bench import measure, poster_view
 from distrace.checkpoint import Model
 from distrace.cli.common import ModelName, opened, show_table
@@ -29,13 +29,14 @@ SHORT: dict[str, str] = {
 class Bench:
     """Measure what tracing costs and how far it is off, against a reference that takes no chances."""
 
-    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory"]]
+    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients"]]
     """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
-    with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels"""
+    with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels;
+    gradients: exact and DIST's against finite differences, and the time of a backward pass"""
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
-    size: int = 512  # pixels along each side, of `trace` and `fields`
+    size: int = 512  # pixels along each side, of `trace`, `fields` and the times of `gradients`
     repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
     device: str = "cpu"
 
@@ -92,6 +93,23 @@ class Bench:
                 bar.advance(f"{size} × {size}: {rows[-1]['mib']:.0f} MiB")
         show_table(rows)
         run.finish({"rows": rows, **origin()})
+
+    def _gradients(self, run: Run, model: Model) -> None:
+        measured, subjects = [], gradients.subjects(model, self.code, min(self.size, gradients.SIZE))
+        with progress("gradients", gradients.COUNT) as bar:
+            for subject in subjects:
+                for row, ratio in gradients.ratio_rows(subject):
+                    measured.append((row, ratio.numpy()))
+                    bar.advance(f"{row.field} by {row.parameter}, {row.method}")
+        rows, ratios = zip(*measured)
+        timings = backward.timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
+        save_text(run.out / "index.html", tables.gradients_page(rows, ratios, timings))
+        facts = [{"model": self.model, **row.asdict()} for row in rows]
+        times = [{"model": self.model, **timing.asdict()} for timing in timings]
+        show_table([{key: value for key, value in row.items() if key not in HIDDEN} for row in facts])
+        show_table([{key: value for key, value in time.items() if key != "model"} for time in times])
+        evaluations = sum(subject.tally.evaluations for subject in subjects)
+        run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
 
 
 def _finish(run: Run, rows: list[dict[str, Any]]) -> None:

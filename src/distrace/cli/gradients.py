@@ -1,0 +1,74 @@
+"""`check-gradients`: every derivative of an image of a model against finite differences."""
+
+import sys
+from copy import deepcopy
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from distrace.camera import Camera
+from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.console import console, origin, start
+from distrace.gradcheck import GradientRow, check_gradients
+from distrace.moves import decoder_changes
+
+
+@dataclass(frozen=True)
+class CheckGradients:
+    """Compare every derivative of an image with finite differences; exit status 1 where one disagrees."""
+
+    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    out: Path = Path("out/check-gradients")
+    code: int = 0  # which training shape
+    azimuth: float = 30.0  # degrees
+    elevation: float = 20.0  # degrees
+    distance: float = 4.97  # of the camera from the origin
+    focal_mm: float = 60.0
+    sensor_mm: float = 32.0
+    size: int = 48  # pixels along each side
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        model, camera = opened(self.model, run.device), self._camera().to(run.device)
+        model.field(self.code)  # refuses a code that is not there
+        decoder, code = deepcopy(model.decoder).double(), model.codes[self.code].detach().double()
+        found = check_gradients(decoder.field(code), camera, parameters=decoder_changes(decoder, code), size=self.size)
+        show_table([_line(row) for row in found.rows])
+        wrong = [row for row in found.rows if not row.agrees]
+        console.print(f"{len(found.rows) - len(wrong)} of {len(found.rows)} agree, to {found.precision.tolerance:g}")
+        facts = {"agrees": found.agrees, "tolerance": found.precision.tolerance, "evaluations": found.evaluations}
+        run.finish({**facts, "rows": [{"model": self.model, **row.asdict()} for row in found.rows], **origin()})
+        if wrong:
+            sys.exit(1)
+
+    def _camera(self) -> Camera:
+        return Camera.orbit(
+            self.azimuth,
+            self.elevation,
+            self.distance,
+            focal_mm=self.focal_mm,
+            sensor_mm=self.sensor_mm,
+            height=self.size,
+            width=self.size,
+        )
+
+
+def _line(row: GradientRow) -> dict[str, object]:
+    """A row for the terminal; its two values are those of the worst pixel, and of that the worst channel."""
+    pairs = zip(row.derivative, row.difference, strict=True)
+    derivative, difference = max(pairs, key=lambda pair: abs(pair[0] - pair[1]))
+    return {
+        "of": row.quantity,
+        "by": row.parameter,
+        "median": row.median,
+        "worst": row.worst,
+        "pixel": f"{row.x}, {row.y}",
+        "along": row.along,
+        "autograd": derivative,
+        "differences": difference,
+        "compared": row.pixels,
+        "left out": row.left_out,
+        "agrees": "yes" if row.agrees else "NO",
+    }

@@ -1,0 +1,130 @@
+"""`check-gradients` and `bench gradients`: what they write, what they say, and the exit status."""
+
+import json
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+import distrace.cli
+import distrace.cli.gradients
+from distrace.checkpoint import save_experiment
+from distrace.gradcheck import GradientCheck, GradientRow, check_gradients
+from distrace.gradients import COUNT
+from distrace.growth import ball
+
+VIEW = ("--distance", "3", "--focal-mm", "40", "--size", "10")
+COMMON = {"seconds", "device", "version", "evaluations", "rows", "command", "machine"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """About a sphere, without any training."""
+    folder = tmp_path_factory.mktemp("models") / "ball"
+    save_experiment(folder, ball(2, 16).decoder, torch.zeros(1, 1), ("ball",))
+    return folder
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    def command(*arguments: object) -> int:
+        """Its exit status."""
+        monkeypatch.setattr(sys, "argv", ["distrace", *map(str, arguments)])
+        try:
+            distrace.cli.main()
+        except SystemExit as stop:
+            return int(stop.code or 0)
+        return 0
+
+    return command
+
+
+def facts(out: Path) -> dict:
+    content = json.loads((out / "result.json").read_text())
+    assert set(content) >= COMMON
+    assert content["evaluations"] > 100
+    return content
+
+
+def only_hits(found: GradientCheck) -> GradientCheck:
+    return replace(found, rows=tuple(row for row in found.rows if row.quantity != "clearance"))
+
+
+def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
+    model: Path, run: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    def of_hits(*arguments, **options) -> GradientCheck:
+        return only_hits(check_gradients(*arguments, **options))
+
+    monkeypatch.setattr(distrace.cli.gradients, "check_gradients", of_hits)
+    assert run("check-gradients", model, "--out", tmp_path, *VIEW) == 0
+    content = facts(tmp_path)
+    assert content["agrees"] is True
+    assert {row["parameter"] for row in content["rows"]} >= {"code", "weights", "placement", "focal length"}
+    keys = {"model", "quantity", "parameter", "median", "worst", "x", "y", "along", "derivative", "difference"}
+    assert all(keys | {"pixels", "left_out", "agrees"} <= set(row) for row in content["rows"])
+    said = capsys.readouterr().out
+    assert f"{len(content['rows'])} of {len(content['rows'])} agree" in said
+    for column in ("of", "by", "median", "worst", "pixel", "along", "autograd", "differences", "left out", "agrees"):
+        assert column in said.splitlines()[0]
+    assert said.count("yes") == len(content["rows"])
+
+
+def test_a_derivative_that_disagrees_is_status_1_and_said(
+    model: Path, run: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    wrong = GradientRow("depth", "code", 0.5, 0.9, 3, 4, "", (1.0,), (2.0,), 10, 0, False)
+
+    def lying(*arguments, **options) -> GradientCheck:
+        found = check_gradients(*arguments, **options)
+        return replace(found, rows=(*only_hits(found).rows, wrong))
+
+    monkeypatch.setattr(distrace.cli.gradients, "check_gradients", lying)
+    assert run("check-gradients", model, "--out", tmp_path, *VIEW) == 1
+    content = facts(tmp_path)
+    assert content["agrees"] is False
+    assert content["rows"][-1]["worst"] == 0.9
+    assert " NO" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("--code 3", "code 3 was asked for"),
+        ("--code -1", "code -1 was asked for"),
+        ("--size 0", "0 × 0"),
+        ("--distance 0", "its own place"),
+        ("--distance 9000 --focal-mm 1", "sees nothing"),
+        ("--device tpu", "is no device"),
+        ("--colour red", "--colour"),
+    ],
+)
+def test_whatever_is_wrong_is_one_line_and_status_2(
+    words: str, message: str, model: Path, run: Callable[..., int], tmp_path: Path, capsys
+) -> None:
+    assert run("check-gradients", model, "--out", tmp_path, *words.split()) == 2
+    said = capsys.readouterr().err
+    assert message in said
+    assert said.count("\n") == 1
+    assert not (tmp_path / "result.json").exists()
+
+
+def test_bench_gradients_writes_a_table_times_and_a_page(model: Path, run: Callable[..., int], tmp_path: Path) -> None:
+    assert run("bench", "gradients", model, "--size", 24, "--repeats", 1, "--out", tmp_path) == 0
+    assert {path.name for path in tmp_path.iterdir()} == {"result.json", "index.html"}
+    content = facts(tmp_path)
+    assert len(content["rows"]) == COUNT
+    assert {"field", "parameter", "method", "relative_error", "ratio", "pixels", "model"} <= set(content["rows"][0])
+    exact = [row for row in content["rows"] if row["method"] == "exact"]
+    assert len(exact) == COUNT / 4
+    assert all(row["relative_error"] < 1e-5 for row in exact)
+    assert {row["parameter"] for row in content["timing"]} == {"code", "camera"}
+    for row in content["timing"]:
+        assert row["ratio"] == pytest.approx(row["backward"] / row["forward"])
+        assert row["visible"] > 20
+    text = (tmp_path / "index.html").read_text(encoding="utf-8")
+    assert text.count("<img") == COUNT / 4
+    assert "decoder by weights: exact, DIST, k = 1" in text

@@ -1,0 +1,204 @@
+"""The check of gradients: it agrees with what is right, and says so of what is wrong."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from distrace import primitives
+from distrace.camera import Camera
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.differences import derivatives, differences
+from distrace.gradcheck import GradientCheck, check_gradients
+from distrace.moves import decoder_changes
+from distrace.retrace import DOUBLE, SINGLE, least_beside, zero_beside
+
+CAMERA = Camera.orbit(30, 20, 4.97, height=16, width=16)
+QUANTITIES = {"distance", "depth", "hit points", "normal", "clearance"}
+PARAMETERS = {"camera rotation", "camera translation", "focal length", "principal point", "placement"}
+
+
+def disagreeing(found: GradientCheck) -> set[tuple[str, str]]:
+    return {(row.quantity, row.parameter) for row in found.rows if not row.agrees}
+
+
+class Scaled(torch.autograd.Function):
+    """The identity, with a backward pass that is wrong by a factor."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> Tensor:
+        return x.clone()
+
+    @staticmethod
+    def backward(ctx, slope: Tensor) -> Tensor:
+        return 1.1 * slope
+
+
+def test_every_quantity_is_compared_by_every_parameter() -> None:
+    found = check_gradients(primitives.sphere(0.5), CAMERA, parameters={"radius": lambda h: primitives.sphere(0.5 + h)})
+    assert {(row.quantity, row.parameter) for row in found.rows} == {
+        (quantity, parameter) for quantity in QUANTITIES for parameter in PARAMETERS | {"radius"}
+    }
+    assert found.agrees
+    assert found.precision == DOUBLE
+    assert found.evaluations > 1000
+    assert max(row.worst for row in found.rows) < 1e-5
+    assert all(row.pixels > 20 and 0 <= row.x < 16 and 0 <= row.y < 16 for row in found.rows)
+    by_radius = {row.quantity: row for row in found.rows if row.parameter == "radius"}
+    assert by_radius["clearance"].derivative == (pytest.approx(-1),)
+    assert by_radius["distance"].derivative[0] < -1
+
+
+@pytest.mark.parametrize(
+    "radius",
+    [lambda h: 0.5 + Scaled.apply(h), lambda h: 0.5 + h.detach(), lambda h: (0.5 + h).clamp_max(0.5)],
+    ids=["scaled", "detached", "clamped"],
+)
+def test_a_lie_about_a_parameter_is_found_and_the_rest_agrees(radius: Callable[[Tensor], Tensor]) -> None:
+    found = check_gradients(
+        primitives.sphere(0.5), CAMERA, parameters={"radius": lambda h: primitives.sphere(radius(h))}
+    )
+    assert disagreeing(found) == {(quantity, "radius") for quantity in QUANTITIES}
+
+
+def test_a_lie_about_one_part_of_space_is_found_at_its_pixels() -> None:
+    """The gradient by the radius is lost on the left half of the image."""
+
+    def sphere(radius: Tensor) -> primitives.SDF:
+        right = torch.tensor([1.0, 0, -0.577], dtype=torch.float64)  # of the camera's plane through the middle
+        return lambda points: points.norm(dim=-1) - torch.where((points @ right) > 0, radius, radius.detach())
+
+    found = check_gradients(primitives.sphere(0.5), CAMERA, parameters={"radius": lambda h: sphere(0.5 + h)})
+    depth = next(row for row in found.rows if (row.quantity, row.parameter) == ("depth", "radius"))
+    assert not depth.agrees
+    assert depth.x < 8
+    assert depth.derivative == (0,)
+    assert depth.difference[0] < -1
+
+
+def test_a_wrong_gradient_in_space_is_found_by_what_depends_on_it() -> None:
+    """Wrong by a direction; a mere factor cancels in −df / (∇f · v)."""
+
+    def sheared(points: Tensor) -> Tensor:
+        return primitives.sphere(0.5)(torch.cat([Scaled.apply(points[..., :1]), points[..., 1:]], dim=-1))
+
+    wrong = disagreeing(check_gradients(sheared, CAMERA))
+    assert {("distance", "camera translation"), ("depth", "placement"), ("clearance", "camera rotation")} <= wrong
+
+
+def test_a_derivative_that_is_no_number_disagrees() -> None:
+    found = check_gradients(
+        primitives.sphere(0.5), CAMERA, parameters={"radius": lambda h: primitives.sphere(0.5 + h + (h * 0).sqrt())}
+    )
+    assert disagreeing(found) == {(quantity, "radius") for quantity in QUANTITIES - {"normal"}} | {("normal", "radius")}
+    assert all(row.worst == torch.inf for row in found.rows if row.parameter == "radius")
+
+
+def test_pixels_on_a_kink_are_left_out_and_counted() -> None:
+    """As the box turns, faces meet on pixels; as h passes 0, its size grows only one way."""
+    half = torch.tensor([0.5, 0.3, 0.4], dtype=torch.float64)
+    found = check_gradients(
+        primitives.box(half), CAMERA, parameters={"size": lambda h: primitives.box(half + h.clamp_min(0))}
+    )
+    for row in found.rows:
+        if row.parameter == "size" and row.quantity != "normal":
+            assert row.pixels == 0 or row.quantity == "clearance", row
+            assert row.left_out > 10
+
+
+def test_a_row_of_which_no_pixel_could_be_compared_does_not_agree() -> None:
+    found = check_gradients(
+        primitives.sphere(0.5), CAMERA, parameters={"kink": lambda h: primitives.sphere(0.5 + h.abs())}
+    )
+    assert disagreeing(found) == {(quantity, "kink") for quantity in QUANTITIES}
+
+
+class Ball(nn.Module):
+    """A smooth network that is about a sphere."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        torch.manual_seed(0)
+        self.layers = nn.Sequential(nn.Linear(3, 16), nn.Softplus(10), nn.Linear(16, 1))
+
+    def forward(self, points: Tensor) -> Tensor:
+        return points.norm(dim=-1) - 0.5 + 0.1 * self.layers(points)[..., 0]
+
+
+def test_of_a_network_the_weights_are_checked_in_double_and_it_stays_as_it_was() -> None:
+    network = Ball()
+    found = check_gradients(network, CAMERA)
+    assert found.agrees
+    assert {row.parameter for row in found.rows} == PARAMETERS | {"weights"}
+    assert found.precision == DOUBLE
+    assert all(weight.dtype == torch.float32 for weight in network.parameters())
+
+
+def test_a_field_that_knows_float32_alone_is_checked_in_that() -> None:
+    network = Ball().requires_grad_(False)
+    found = check_gradients(lambda points: network(points), CAMERA)
+    assert found.precision == SINGLE
+    assert found.agrees, disagreeing(found)
+    lying = {"offset": lambda h: lambda points: network(points) + Scaled.apply(h)}
+    found = check_gradients(lambda points: network(points), CAMERA, parameters=lying)
+    assert disagreeing(found) >= {("depth", "offset"), ("clearance", "offset")}
+
+
+def test_of_a_decoder_code_and_weights_are_checked() -> None:
+    torch.manual_seed(1)
+    decoder = Decoder(NetworkSpecs(dims=(32,) * 3, code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))).eval()
+    with torch.no_grad():
+        decoder.lin3.bias.fill_(-0.1)
+        decoder.lin3.weight.abs_()
+    double, code = decoder.double(), 0.1 * torch.ones(4, dtype=torch.float64)
+    found = check_gradients(double.field(code), CAMERA, parameters=decoder_changes(double, code))
+    rows = {(row.quantity, row.parameter): row for row in found.rows}
+    for parameter in ("code", "weights"):
+        for quantity in ("distance", "depth", "hit points", "normal"):
+            assert rows[quantity, parameter].agrees, rows[quantity, parameter]
+            assert rows[quantity, parameter].pixels > 10
+    own = check_gradients(decoder.float().field(code.float()), CAMERA, size=8)
+    assert own.precision == DOUBLE
+    assert {row.parameter for row in own.rows} == PARAMETERS | {"weights"}
+
+
+def test_what_cannot_be_checked_is_refused() -> None:
+    with pytest.raises(ValueError, match="sees nothing"):
+        check_gradients(lambda points: points.norm(dim=-1) + 1, CAMERA)
+    with pytest.raises(ValueError, match="an image of 0 pixels"):
+        check_gradients(primitives.sphere(0.5), CAMERA, size=0)
+
+
+def test_derivatives_are_those_of_every_element_and_zero_where_there_is_no_way() -> None:
+    like, x = torch.zeros((), dtype=torch.float64), torch.arange(4, dtype=torch.float64)
+    images = lambda h: {"sine": torch.sin(x + h), "none": x, "product": x * (3 * h)}  # noqa: E731
+    found = derivatives(images, like)
+    central, bend = differences(images, images(like), 1e-5, like)
+    for name, expected in {"sine": x.cos(), "none": 0 * x, "product": 3 * x}.items():
+        torch.testing.assert_close(found[name], expected)
+        torch.testing.assert_close(central[name], expected, rtol=0, atol=1e-9)
+        assert bend[name].abs().max() < 1e-4
+    assert derivatives(lambda h: {"none": x}, like)["none"].eq(0).all()
+
+
+def test_the_zero_beside_a_hit_is_found_or_none_is_claimed() -> None:
+    rays = CAMERA.rays()[8:9, 8:9].flat()
+    rays = type(rays)(rays.origins.double(), rays.directions.double())
+    rays = type(rays)(rays.origins, rays.directions / rays.directions.norm(dim=-1, keepdim=True))
+    middle = -(rays.origins * rays.directions).sum(-1)
+    away = (rays.origins.square().sum(-1) - middle**2).sqrt()
+    exact = middle - (0.25 - away**2).sqrt()
+    slope = (rays.at(exact) * rays.directions).sum(-1) / 0.5
+    torch.testing.assert_close(zero_beside(primitives.sphere(0.5), rays, exact + 1e-6, slope, 1e-11), exact)
+    assert zero_beside(lambda p: p.norm(dim=-1) + 1, rays, exact, slope, 1e-11).isnan().all()
+    torch.testing.assert_close(least_beside(primitives.sphere(away - 0.1), rays, middle + 1e-5, 5e-5), away * 0 + 0.1)
+
+
+def test_the_least_value_at_a_corner_is_between_all_samples() -> None:
+    """|x| + 1 along the ray: no sample meets the corner, but two lines do."""
+    rays = CAMERA.rays()[0, :1]
+    rays = type(rays)(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0, 0]], dtype=torch.float64))
+    corner = lambda p: 1 + torch.where(p[..., 0] > 0.5, p[..., 0] - 0.5, 0.3 * (0.5 - p[..., 0]))  # noqa: E731
+    found = least_beside(corner, rays, torch.tensor([0.50003], dtype=torch.float64), 5e-5)
+    assert found.item() == pytest.approx(1, abs=1e-14)
