@@ -127,6 +127,19 @@ def test_the_gradient_agrees_with_differences_of_a_finer_image(image, at: float,
     assert derivative(mean(size), at) == pytest.approx(expected, rel=0.05)
 
 
+@pytest.mark.parametrize("at", [0.3, 0.31, 0.33])
+def test_an_outline_moves_the_pixel_more_whose_centre_is_nearer(at: float) -> None:
+    """The straight edge of a box: each of its two pixels changes by its tent, one pixel to either side."""
+    width, front, size = torch.tensor(at, dtype=f64, requires_grad=True), 0.1, 16
+    half = torch.stack([width, *torch.tensor([0.5, front], dtype=f64)])
+    row = shade(seen(primitives.box(half), view(size)), black, WHITE)[size // 2, :, 0]
+    scale = size * FOCAL / (DISTANCE - front)
+    edge = size / 2 + scale * at
+    found = torch.stack([torch.autograd.grad(row[x], width, retain_graph=True)[0] for x in range(size // 2, size)])
+    centres = torch.arange(size // 2, size, dtype=f64) + 0.5
+    torch.testing.assert_close(found, -scale * (1 - (centres - edge).abs()).clamp_min(0), rtol=0, atol=0.02 * scale)
+
+
 def test_of_a_shaded_sphere_hits_and_outline_together_make_the_derivative() -> None:
     """By the closed form of a distant disk's mean: r² · a constant. Hits near a round outline need some averaging."""
 

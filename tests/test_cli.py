@@ -218,6 +218,18 @@ def test_complete_in_a_few_iterations_still_ends_with_a_code(
     assert "chamfer" not in result(tmp_path), "nothing was given to measure against"
 
 
+def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
+    run("complete", model, observation, "--solver", "lm", "--starts", 2, "--resolution", 16, "--out", tmp_path)
+    fitted = load_model(model).field(torch.from_numpy(np.load(tmp_path / "code.npy")))
+    surface = 0.6 * torch.nn.functional.normalize(
+        torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1
+    )
+    assert fitted(surface).abs().mean() < 0.03
+    facts = result(tmp_path, "evaluations", "loss", "terms")
+    assert set(facts["terms"]) == {"depth", "missing", "extra", "code"}
+    assert "15, after 3 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
     run("bench", "trace", model, "--code", 1, "--size", 24, "--out", tmp_path)
     assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}

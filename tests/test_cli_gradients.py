@@ -65,10 +65,22 @@ def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
     assert content["agrees"] is True
     assert {row["parameter"] for row in content["rows"]} >= {"code", "weights", "placement", "focal length"}
     keys = {"model", "quantity", "parameter", "median", "worst", "x", "y", "along", "derivative", "difference"}
-    assert all(keys | {"pixels", "left_out", "agrees"} <= set(row) for row in content["rows"])
+    assert all(keys | {"pixels", "off", "left_out", "agrees"} <= set(row) for row in content["rows"])
     said = capsys.readouterr().out
     assert f"{len(content['rows'])} of {len(content['rows'])} agree" in said
-    for column in ("of", "by", "median", "worst", "pixel", "along", "autograd", "differences", "left out", "agrees"):
+    for column in (
+        "of",
+        "by",
+        "median",
+        "worst",
+        "pixel",
+        "along",
+        "autograd",
+        "differences",
+        "off",
+        "left out",
+        "agrees",
+    ):
         assert column in said.splitlines()[0]
     assert said.count("yes") == len(content["rows"])
 
@@ -76,7 +88,7 @@ def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
 def test_a_derivative_that_disagrees_is_status_1_and_said(
     model: Path, run: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    wrong = GradientRow("depth", "code", 0.5, 0.9, 3, 4, "", (1.0,), (2.0,), 10, 0, False)
+    wrong = GradientRow("depth", "code", 0.5, 0.9, 3, 4, "", (1.0,), (2.0,), 10, 9, 0, False)
 
     def lying(*arguments, **options) -> GradientCheck:
         found = check_gradients(*arguments, **options)

@@ -142,6 +142,32 @@ def test_a_fit_without_views_or_samples_is_refused() -> None:
         next(fit_samples(Spheres(), torch.empty(0, 4)))
 
 
+def test_a_view_from_inside_the_mean_shape_is_refused() -> None:
+    inside = Camera.orbit(30, 20, 0.2, height=8, width=8, focal_px=4.0)
+    with pytest.raises(ValueError, match=r"the camera at \[0.094, 0.068, 0.163\] is inside the mean shape"):
+        next(fit_shape(Spheres(), [view_of(TRUE), View(inside, torch.full((8, 8), 0.3))], PRIOR, CONFIG))
+
+
+def test_normals_alone_tell_where_a_sphere_is() -> None:
+    view = view_of(TRUE, mask=False, normal=True)
+    known = replace(view, depth=torch.full_like(view.depth, torch.inf))
+    assert everything(known).is_object.all()
+    step = last(fit_shape(Spheres(), [known], PRIOR, CONFIG))
+    assert step.terms["normal"] < 0.01
+    assert step.terms["missing"] < 1e-3
+
+
+@pytest.mark.parametrize("mask", [True, False])
+def test_odd_views_end_with_a_code(mask: bool) -> None:
+    """One pixel, and one that overlaps with no rendering: it is seen where the mean shape is not."""
+    pixel = view_of(TRUE, CAMERA.cropped(20, 20, 1, 1), mask=mask)
+    beside = view_of(torch.tensor([0.1, 0.6, 0.0, -0.3]), mask=mask)
+    for view in (pixel, beside):
+        step = last(fit_shape(Spheres(), [view], PRIOR, replace(CONFIG, iterations=5)))
+        assert step.code.isfinite().all()
+        assert not torch.equal(step.code, PRIOR.mean)
+
+
 def test_a_perfect_rendering_lacks_nothing() -> None:
     view = view_of(TRUE, normal=True)
     terms = view_terms(Spheres().field(TRUE), [everything(view)], replace(CONFIG, margin=0.0))

@@ -10,7 +10,7 @@ from distrace import primitives
 from distrace.camera import Camera
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.differences import derivatives, differences
-from distrace.gradcheck import GradientCheck, check_gradients
+from distrace.gradcheck import STRAY, GradientCheck, check_gradients
 from distrace.moves import decoder_changes
 from distrace.retrace import DOUBLE, SINGLE, least_beside, zero_beside
 
@@ -75,6 +75,42 @@ def test_a_lie_about_one_part_of_space_is_found_at_its_pixels() -> None:
     assert depth.x < 8
     assert depth.derivative == (0,)
     assert depth.difference[0] < -1
+
+
+@pytest.mark.parametrize(("width", "agrees"), [(0.08, True), (0.3, False)])
+def test_a_hundredth_of_the_pixels_may_be_off(width: float, agrees: bool) -> None:
+    """The gradient is lost in a small ball about the point of the sphere next to the camera."""
+    middle = 0.5 * CAMERA.T_world_camera[:3, 3].double() / 4.97
+
+    def sphere(radius: Tensor) -> primitives.SDF:
+        lost = lambda points: (points - middle).norm(dim=-1) < width / 2  # noqa: E731
+        return lambda points: points.norm(dim=-1) - torch.where(lost(points), radius.detach(), radius)
+
+    camera = Camera.orbit(30, 20, 4.97, height=47, width=47)
+    found = check_gradients(primitives.sphere(0.5), camera, parameters={"radius": lambda h: sphere(0.5 + h)})
+    depth = next(row for row in found.rows if (row.quantity, row.parameter) == ("depth", "radius"))
+    assert depth.agrees == agrees
+    assert depth.worst == pytest.approx(1, abs=1e-3)
+    assert depth.off > 0
+    assert (depth.off <= STRAY * depth.pixels) == agrees
+
+
+def test_not_one_derivative_may_be_no_number() -> None:
+    middle = 0.5 * CAMERA.T_world_camera[:3, 3].double() / 4.97
+
+    def sphere(h: Tensor) -> primitives.SDF:
+        def sdf(points: Tensor) -> Tensor:
+            value = points.norm(dim=-1) - 0.5 - h
+            lost = (points - middle).norm(dim=-1) < 0.04
+            return value + torch.zeros_like(value).index_put((lost,), (h * 0).sqrt())
+
+        return sdf
+
+    camera = Camera.orbit(30, 20, 4.97, height=47, width=47)
+    found = check_gradients(primitives.sphere(0.5), camera, parameters={"radius": sphere})
+    depth = next(row for row in found.rows if (row.quantity, row.parameter) == ("depth", "radius"))
+    assert (depth.off, depth.worst) == (1, torch.inf)
+    assert not depth.agrees
 
 
 def test_a_wrong_gradient_in_space_is_found_by_what_depends_on_it() -> None:
@@ -145,22 +181,36 @@ def test_a_field_that_knows_float32_alone_is_checked_in_that() -> None:
     assert disagreeing(found) >= {("depth", "offset"), ("clearance", "offset")}
 
 
-def test_of_a_decoder_code_and_weights_are_checked() -> None:
+def small_decoder() -> Decoder:
     torch.manual_seed(1)
     decoder = Decoder(NetworkSpecs(dims=(32,) * 3, code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))).eval()
     with torch.no_grad():
         decoder.lin3.bias.fill_(-0.1)
         decoder.lin3.weight.abs_()
-    double, code = decoder.double(), 0.1 * torch.ones(4, dtype=torch.float64)
+    return decoder
+
+
+def test_of_a_decoder_code_and_weights_are_checked() -> None:
+    double, code = small_decoder().double(), 0.1 * torch.ones(4, dtype=torch.float64)
     found = check_gradients(double.field(code), CAMERA, parameters=decoder_changes(double, code))
     rows = {(row.quantity, row.parameter): row for row in found.rows}
     for parameter in ("code", "weights"):
         for quantity in ("distance", "depth", "hit points", "normal"):
             assert rows[quantity, parameter].agrees, rows[quantity, parameter]
             assert rows[quantity, parameter].pixels > 10
-    own = check_gradients(decoder.float().field(code.float()), CAMERA, size=8)
+
+
+def test_a_decoder_s_field_knows_its_code_and_the_decoder_stays_as_it_was() -> None:
+    decoder = small_decoder()
+    own = check_gradients(decoder.field(0.1 * torch.ones(4)), CAMERA, size=8)
     assert own.precision == DOUBLE
-    assert {row.parameter for row in own.rows} == PARAMETERS | {"weights"}
+    assert {row.parameter for row in own.rows} == PARAMETERS | {"code", "weights"}
+    double = small_decoder().double()
+    code = (0.1 * torch.ones(4)).double()
+    assert (
+        own.rows == check_gradients(double.field(code), CAMERA, parameters=decoder_changes(double, code), size=8).rows
+    )
+    assert all(weight.dtype == torch.float32 and weight.requires_grad for weight in decoder.parameters())
 
 
 def test_what_cannot_be_checked_is_refused() -> None:

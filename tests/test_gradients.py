@@ -17,7 +17,7 @@ from distrace.gradcheck import check_gradients
 from distrace.gradients import COUNT, QUERIES, RatioRow, ratio_rows, subjects
 from distrace.growth import ball
 from distrace.moves import Move, all_moves
-from distrace.retrace import DOUBLE, View
+from distrace.retrace import DOUBLE, Retraced
 
 f64 = torch.float64
 RADIUS, CENTRE = 0.5, torch.tensor([0.1, -0.05, 0.2], dtype=f64)
@@ -56,8 +56,8 @@ def test_autograd_and_finite_differences_agree_on_clearance(name: str) -> None:
     assert all(row.agrees and row.pixels > 30 for row in rows), rows
 
 
-def met(sdf: SDF, camera: Camera, moved: str) -> tuple[View, dict[str, Move]]:
-    return View.of(sdf, camera, 1.0, DOUBLE), dict(all_moves(sdf, camera, {})[moved])
+def met(sdf: SDF, camera: Camera, moved: str) -> tuple[Retraced, dict[str, Move]]:
+    return Retraced.of(sdf, camera, 1.0, DOUBLE), dict(all_moves(sdf, camera, {})[moved])
 
 
 def images(camera: Camera, distance: Tensor, hit: Tensor, normal: Tensor) -> Images:
@@ -216,7 +216,7 @@ def test_a_subject_counts_what_it_asked_for() -> None:
 def test_rays_of_a_moved_camera_are_those_that_are_compared() -> None:
     """The view is seen through the moved camera, not through its own."""
     sdf = FIELDS["sphere"][0]
-    view = View.of(sdf, VIEW, 1.0, DOUBLE)
+    view = Retraced.of(sdf, VIEW, 1.0, DOUBLE)
     nearer = replace(VIEW, T_world_camera=VIEW.T_world_camera.clone())
     nearer.T_world_camera[:3, 3] *= 1 - 1e-7
     moved, here = view.traced_anew(sdf, nearer), view.traced_anew(sdf, VIEW)

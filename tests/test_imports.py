@@ -28,7 +28,7 @@ ORDER = [
     ),
     *("differences", "moves", "retrace", "gradcheck", "dist_gradient"),
     *("losses", "warp", "metrics", "mesh", "data", "targets"),
-    *("train", "resume", "fit", "fit_samples"),
+    *("train", "resume", "fit", "fit_samples", "solver", "code_residuals", "fit_code"),
     *(
         "bench",
         "ablation",
@@ -37,6 +37,7 @@ ORDER = [
         "gradients",
         "backward",
         "evaluate",
+        "solvers",
         "page",
         "charts",
         "scene",

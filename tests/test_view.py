@@ -125,10 +125,10 @@ SINGULAR = np.array([[4, 4, 2], [4, 4, 1.5], [0, 0, 1]], np.float32)
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
-        ({"depth": np.ones((3, 4, 1), np.float32)}, r"depth has shape \[3, 4, 1\]"),
+        ({"depth": np.ones((3, 4, 2), np.float32)}, r"depth has shape \[3, 4, 2\]"),
         ({"depth": np.float32(2.5)}, r"depth has shape \[\]"),
-        ({"depth": np.ones((0, 4), np.float32)}, "no camera"),
-        ({"depth": np.array([["a", "b"]])}, "not an observation"),
+        ({"depth": np.ones((0, 4), np.float32)}, r"depth has shape \[0, 4\]"),
+        ({"depth": np.array([["a", "b"]])}, "depth holds <U1"),
         ({"mask": np.ones((4, 3), bool)}, r"mask has shape \[4, 3\]; beside this depth it must be \[3, 4\]"),
         ({"normal": np.ones((3, 4), np.float32)}, r"normal has shape \[3, 4\]; .* \[3, 4, 3\]"),
         ({"intrinsics": np.eye(4, dtype=np.float32)}, "intrinsics are"),

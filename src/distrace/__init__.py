@@ -12,6 +12,8 @@ from distrace.field import placed as placed
 from distrace.fit import FitConfig as FitConfig
 from distrace.fit import fit_shape as fit_shape
 from distrace.fit import prior_of as prior_of
+from distrace.fit_camera import CameraConfig as CameraConfig
+from distrace.fit_camera import fit_camera as fit_camera
 from distrace.gradcheck import GradientCheck as GradientCheck
 from distrace.gradcheck import check_gradients as check_gradients
 from distrace.lattice import Lattice as Lattice

@@ -1,32 +1,36 @@
-"""What a known shape, seen by a camera, lacks of an observed view: residuals on rays and their exact Jacobian."""
+"""How far a known shape before a camera is from what was observed: residuals along rays and their exact Jacobian."""
 
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from distrace.camera import Camera
-from distrace.data.view import View
 from distrace.fast import near_surface, prepared
 from distrace.field import SDF, value_and_gradient
 from distrace.forecast import Kind, forecast
 from distrace.lattice import Lattice
 from distrace.pose import object_in_camera
 from distrace.rays import Bounds, Rays, meet_box, meet_sphere
+from distrace.roots import Guess, settle
+from distrace.sight import Sight
 from distrace.solver import Residuals
 from distrace.surface import minimum
-from distrace.targets import OUTLINE, band
-from distrace.trace import Trace, TraceConfig, sphere_trace
+from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
 
-APART = 0.015  # between the points whose normals tell how the surface bends: a decoder's facets are smaller
-CORE = 0.5  # of the sphere: rays that miss it are drawn to within
-MARCH = TraceConfig(coarse_levels=0, step_scale=1.2, tolerance=3e-4, steps=30, least_step=1e-3)
+APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
+CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
+REACH = 0.05  # for the least value on a ray: then to a fifth of that, and to a fifth of that
+LATTICE_DOUBT = 0.3
+CLOSE = 3e-4  # enough for a step of the solver
+MARCH = TraceConfig(coarse_levels=0, step_scale=1.2, tolerance=CLOSE, steps=30, least_step=1e-3)
 
 
 @dataclass(frozen=True)
 class Accuracy:
-    """What deviations count alike: of depths and outlines in units of the sphere's radius, of normals in radians."""
+    """What deviations count alike: of depths and outlines in units of the unit sphere, of normals in radians."""
 
     depth: float = 0.01
     outline: float = 0.01
@@ -34,38 +38,7 @@ class Accuracy:
 
 
 @dataclass(frozen=True)
-class Sight:
-    """Rays of a view in its camera's axes: what was seen there. A depth is `inf` and a normal zero where unknown."""
-
-    pixels: Float[Tensor, "n 2"]
-    depth: Float[Tensor, "n"]
-    is_object: Bool[Tensor, "n"]
-    is_background: Bool[Tensor, "n"]
-    normal: Float[Tensor, "n 3"]
-
-    @staticmethod
-    def of(view: View, rays: int, seed: int = 0, width: int = OUTLINE) -> "Sight":
-        """A third of the rays each on the object, beside its outline and around it; without a mask all on the object."""
-        random = torch.Generator().manual_seed(seed)
-        normals = torch.zeros(*view.depth.shape, 3) if view.normal is None else view.normal
-        known = view.seen | (normals.norm(dim=-1) > 0.5)
-        inside = known if view.mask is None else known | view.mask
-        regions = [inside] if view.mask is None else [inside, band(view.mask, width), _around(view.mask)]
-        chosen = torch.cat([_some(region, rays // len(regions), random) for region in regions])
-        is_object = inside.reshape(-1)[chosen]
-        is_background = torch.zeros_like(is_object) if view.mask is None else ~is_object
-        rotation = view.camera.T_world_camera[:3, :3]
-        return Sight(
-            view.camera.pixels().reshape(-1, 2)[chosen],
-            view.depth.reshape(-1)[chosen],
-            is_object,
-            is_background,
-            normals.reshape(-1, 3)[chosen] @ rotation,
-        )
-
-
-@dataclass(frozen=True)
-class Scene:
+class Still:
     """A shape that stays as it is, with the lattice that tells where its surface may be."""
 
     sdf: SDF
@@ -73,121 +46,130 @@ class Scene:
     lattice: Lattice
 
     @staticmethod
-    def of(sdf: SDF, like: Tensor) -> "Scene":
+    def of(sdf: SDF, like: Tensor) -> "Still":
         lattice, _ = prepared(sdf, like)
-        return Scene(sdf, near_surface(sdf, lattice), lattice)
+        return Still(sdf, near_surface(sdf, lattice), lattice)
 
     @torch.no_grad()
     def trace(self, rays: Rays, bounds: Bounds) -> Trace:
-        """From where the surface may first be; rays that pass it by are not marched."""
+        """Rays with a clear root are settled there, those that may meet the surface are marched, others pass by."""
         box = self.lattice.box()
         within = bounds if box is None else meet_box(rays, *box)
-        begin, end = within.near.maximum(bounds.near), within.far.minimum(bounds.far)
-        ahead = forecast(self.lattice, rays, begin, end, pass_near=False)
-        possible = ahead.kind != Kind.NOTHING
-        bounds = Bounds(bounds.near.masked_fill(~possible, torch.inf), bounds.far)
-        trace = sphere_trace(self.lattice.near, rays, bounds, MARCH, ahead.begins)
-        middle = -(rays.origins * rays.directions).sum(-1).clamp_max(0)  # beside the middle, until more is known
+        ahead = forecast(self.lattice, rays, within.near.maximum(bounds.near), within.far.minimum(bounds.far))
+        guess = Guess(ahead.distance, ahead.slope, torch.full_like(ahead.slope, LATTICE_DOUBT))
+        root = (ahead.kind == Kind.ROOT) & (ahead.begins > bounds.near)
+        settled = settle(self.lattice.near, rays[root], guess[root], CLOSE, self.lattice.cell)
+        distance = torch.full_like(ahead.distance, torch.inf)
+        distance[root] = settled.distance.nan_to_num(torch.inf)
+        left = (ahead.kind != Kind.NOTHING) & ~distance.isfinite()
+        some = Bounds(bounds.near.masked_fill(~left, torch.inf), bounds.far)
+        trace = sphere_trace(self.lattice.near, rays, some, MARCH, ahead.begins)
+        outcome = trace.outcome.masked_fill(distance.isfinite(), int(Outcome.HIT))
+        middle = -(rays.origins * rays.directions).sum(-1).clamp_max(0)  # beside the middle, where no more is known
         passed = torch.where(ahead.closest.isfinite(), ahead.closest, middle)
-        closest = torch.where(possible, trace.closest, passed)
-        return Trace(trace.distance, trace.outcome, closest, trace.stopped, trace.evaluations)
+        closest = torch.where(left, trace.closest, passed)
+        return Trace(distance.minimum(trace.distance), outcome, closest, closest, trace.evaluations)
 
 
 @torch.no_grad()
-def residuals(scene: Scene, sight: Sight, camera: Camera, accuracy: Accuracy, *, focal: bool) -> Residuals:
-    """Along rays: how far depth, outline and normals are off; and their change with turn, shift and log focal length.
+def residuals(shape: Still, sight: Sight, camera: Camera, accuracy: Accuracy, *, focal: bool) -> Residuals:
+    """Of all rays that disagree, by how the shape turns and shifts before the camera (and the log of its focal length).
 
-    A depth is off by (z − z_observed) · |∇f · v|, which is how far the surface is from the observed point. A ray that
-    should hit and does not is off by the least value of f on it, and so is one that hits and should not; all three
-    change with the shape's motion dp by ∇f · dp.
+    A depth is off by (z − z_observed) · |∇f · v|: how far the surface is from the observed point. A ray that should hit
+    is off by the least value of f on it. One that should miss is off by as far as its hit lies from the object that was
+    observed, across the view; where the outline itself is on the ray, by the least value, closely, too.
     """
-    rays = camera.rays(sight.pixels)
+    rays, cosines = camera.rays(sight.pixels), camera.cosines(sight.pixels)
     bounds = meet_sphere(rays)
-    trace = scene.trace(rays, bounds)
-    lacking, extra = sight.is_object & ~trace.hit, sight.is_background & trace.hit
-    seen = trace.hit & (sight.depth.isfinite() | (sight.normal.norm(dim=-1) > 0.5))
-    t = torch.where(trace.hit, trace.distance, trace.closest)
-    off = (lacking | extra) & bounds.meets
-    t[off] = minimum(scene.sdf, rays[off], t[off], Bounds(bounds.near[off], bounds.far[off]))
+    trace = shape.trace(rays, bounds)
+    beyond = sight.is_background & trace.hit & (sight.outside.norm(dim=-1) > 0)
+    lacking = torch.where(trace.hit, sight.is_background & ~beyond, sight.is_object)
     astray = lacking & ~bounds.meets
-    rows = (off | astray | seen).nonzero()[:, 0]
-    here = _Here.of(camera, rays[rows], t[rows], focal)
-    value, gradient = value_and_gradient(scene.near, here.points)
-    gradient = torch.where(astray[rows, None], torch.nn.functional.normalize(here.points, dim=-1), gradient)
-    value = torch.where(astray[rows], here.points.norm(dim=-1) - CORE, value)
-    parts = []
-    silhouette = (off | astray)[rows]
-    parts.append(_part(value, here.change(gradient), accuracy.outline, silhouette))
-    depth, observed = (t * camera.cosines(sight.pixels))[rows], sight.depth[rows]
-    slope = (gradient * rays.directions[rows]).sum(-1).abs() / camera.cosines(sight.pixels[rows])
-    parts.append(_part((depth - observed) * slope, here.change(gradient), accuracy.depth, ~silhouette & observed.isfinite()))
-    with_normal = ~silhouette & (sight.normal[rows].norm(dim=-1) > 0.5)
-    if with_normal.any():
-        off_normal, change = _normals(scene, here, gradient, rays.directions[rows], with_normal)
-        parts.append((((off_normal - sight.normal[rows][with_normal]) / accuracy.normal).reshape(-1), (change / accuracy.normal).flatten(0, 1)))
+    seen = trace.hit & ~sight.is_background
+    t = torch.where(trace.hit, trace.distance, trace.closest)
+    low = lacking & sight.is_object & sight.is_background & bounds.meets  # others need not be known so closely
+    some = Bounds(bounds.near[low], bounds.far[low])
+    t[low] = minimum(shape.sdf, rays[low], t[low], some, reach=REACH, refine=2)
+    rows = (lacking | beyond | seen).nonzero()[:, 0]
+    here = _Here.of(shape.near, camera, rays[rows], t[rows], astray[rows], focal=focal)
+    off = (t * cosines - sight.depth)[rows] * here.slope / cosines[rows]
+    parts = [
+        here.part(here.value, lacking[rows], accuracy.outline),
+        here.part(off, (seen & sight.depth.isfinite())[rows], accuracy.depth),
+        here.across(sight.outside[rows], beyond[rows], camera, accuracy.outline),
+        here.normals(shape.near, sight.normal[rows], (seen & sight.has_normal)[rows], accuracy.normal),
+    ]
     values, jacobian = (torch.cat(part) for part in zip(*parts))
-    return Residuals(values, jacobian, torch.full_like(values, 1 / len(sight.pixels)))
-
-
-def _part(values, jacobian, scale, where):
-    return values[where] / scale, jacobian[where] / scale
+    weights = torch.full_like(values, 1 / len(sight.pixels))
+    weights[len(values) - len(parts[-1][0]) :] /= 3  # of a normal's three parts
+    return Residuals(values, jacobian, weights)
 
 
 @dataclass(frozen=True)
 class _Here:
-    points: Tensor
-    rotation: Tensor  # world to camera
-    motion: Tensor  # [n, 3, unknowns] of points in the camera's axes, by the unknowns, at fixed depth
+    """Points on rays, and how the points of the shape there move before the camera, by each unknown."""
+
+    points: Float[Tensor, "n 3"]  # in the world …
+    seen: Float[Tensor, "n 3"]  # … and in the camera's axes
+    directions: Float[Tensor, "n 3"]
+    value: Float[Tensor, "n"]
+    gradient: Float[Tensor, "n 3"]
+    rotation: Float[Tensor, "3 3"]  # from world to camera
+    motion: Float[Tensor, "n 3 unknowns"]  # in the camera's axes
 
     @staticmethod
-    def of(camera, rays, t, focal):
+    def of(sdf: SDF, camera: Camera, rays: Rays, t: Tensor, astray: Tensor, *, focal: bool) -> "_Here":
+        """Where rays go astray the field is unknown; there it is a ball's."""
         rotation, translation = object_in_camera(camera)
         points = rays.at(t)
-        about = points @ rotation.T  # seen from the middle of the object, in the camera's axes
-        axes = torch.eye(3, dtype=about.dtype, device=about.device)
-        turn = torch.linalg.cross(about[:, None], axes[None]).transpose(1, 2)
-        columns = [turn, -axes.expand(len(about), 3, 3)]
+        value, gradient = value_and_gradient(sdf, points)
+        value = torch.where(astray, points.norm(dim=-1) - CORE, value)
+        gradient = torch.where(astray[:, None], normalize(points, dim=-1), gradient)
+        from_middle = points @ rotation.T
+        axes = torch.eye(3).to(points).expand(len(points), 3, 3)
+        columns = [_crossed(axes, from_middle), axes]
         if focal:
-            across = (about + translation) * about.new_tensor([-1.0, -1.0, 0.0])
-            columns.append(across[:, :, None])
-        return _Here(points, rotation, torch.cat(columns, dim=2))
+            columns.append(((from_middle + translation) * points.new_tensor([1.0, 1.0, 0.0]))[:, :, None])
+        motion = torch.cat(columns, dim=2)
+        return _Here(points, from_middle + translation, rays.directions, value, gradient, rotation, motion)
 
-    def change(self, gradient):
-        return torch.einsum("nk,nku->nu", gradient @ self.rotation.T, self.motion)
+    @property
+    def slope(self) -> Float[Tensor, "n"]:
+        return (self.gradient * self.directions).sum(-1).abs()
+
+    def part(self, values: Tensor, where: Bool[Tensor, "n"], scale: float) -> tuple[Tensor, Tensor]:
+        """Residuals that change as the field does at a fixed point: by −∇f · motion."""
+        gradient = self.gradient[where] @ self.rotation.T
+        return values[where] / scale, -torch.einsum("nk,nku->nu", gradient, self.motion[where]) / scale
+
+    def across(self, outside: Tensor, where: Bool[Tensor, "n"], camera: Camera, scale: float) -> tuple[Tensor, Tensor]:
+        """How far points are from the observed object, at their depth and parallel to the image."""
+        seen, motion, z = self.seen[where], self.motion[where], self.seen[where, 2:]
+        away, away_by = outside[where].norm(dim=-1), normalize(outside[where], dim=-1)
+        lateral = motion[:, :2] - (seen[:, :2] / z)[:, :, None] * motion[:, 2:]
+        values = away * z[:, 0] / camera.intrinsics[0, 0]
+        return values / scale, torch.einsum("nk,nku->nu", away_by, lateral) / scale
+
+    def normals(self, sdf: SDF, observed: Tensor, where: Bool[Tensor, "n"], scale: float) -> tuple[Tensor, Tensor]:
+        """Differences of normals in the camera's axes; they turn with the shape, and as the hit slides over its bends.
+
+        Bends are differences over APART: a ReLU network has none but at its facets' edges.
+        """
+        normal, ray = normalize(self.gradient[where], dim=-1), self.directions[where]
+        side = normalize(torch.linalg.cross(normal, normal.roll(1, -1) + 0.1), dim=-1)
+        tangents = torch.stack([side, torch.linalg.cross(normal, side)], dim=1)
+        _, around = value_and_gradient(sdf, self.points[where, None] + APART * torch.cat([tangents, -tangents], dim=1))
+        ahead, behind = normalize(around, dim=-1).split(2, dim=1)
+        motion = -torch.einsum("kj,nku->nju", self.rotation, self.motion[where])  # of a fixed point over the shape
+        along = torch.einsum("nj,nju->nu", normal, motion) / (normal * ray).sum(-1).clamp_max(-0.05)[:, None]
+        slid = torch.einsum("nsj,nju->nsu", tangents, motion - ray[:, :, None] * along[:, None])
+        bent = torch.einsum("nsj,nsu->nju", (ahead - behind) / (2 * APART), slid)
+        change = torch.einsum("ij,nju->niu", self.rotation, bent)
+        seen = normal @ self.rotation.T
+        change[:, :, :3] += _crossed(torch.eye(3).to(seen).expand(len(seen), 3, 3), seen)
+        return ((seen - observed[where]) / scale).flatten(), (change / scale).flatten(0, 1)
 
 
-def _normals(scene, here, gradient, directions, which):
-    """Normals in the camera's axes, and their change: as the shape turns, and as the hit slides over its bends."""
-    unit = torch.nn.functional.normalize(gradient[which], dim=-1)
-    side = torch.linalg.cross(unit, unit.roll(1, -1) + 0.1)
-    tangents = torch.stack([side, torch.linalg.cross(unit, side)], dim=1)
-    tangents = torch.nn.functional.normalize(tangents, dim=-1)
-    around = here.points[which, None] + APART * torch.cat([tangents, -tangents], dim=1)
-    _, gradients = value_and_gradient(scene.near, around)
-    ahead, behind = torch.nn.functional.normalize(gradients, dim=-1).split(2, dim=1)
-    bend = (ahead - behind) / (2 * APART)  # [n, tangent, 3]
-    ray = directions[which]
-    motion = torch.einsum("kj,nku->nju", here.rotation, here.motion[which])  # world axes
-    slide = torch.einsum("nj,nju->nu", unit, motion) / (unit * ray).sum(-1).clamp_max(-0.05)[:, None]
-    motion = motion - ray[:, :, None] * slide[:, None]
-    change = torch.einsum("nsk,nsj,nju->nku", bend, tangents, motion)
-    turned = torch.einsum("ik,nku->niu", here.rotation, change)
-    normal = unit @ here.rotation.T
-    axes = torch.eye(3, dtype=normal.dtype, device=normal.device)
-    turned[..., :3] -= torch.linalg.cross(normal[:, None], axes[None]).transpose(1, 2)
-    return normal, turned
-
-
-def _around(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """A box around the object, half as large again to each side."""
-    rows, columns = (mask.any(axis).nonzero()[:, 0] for axis in (1, 0))
-    box = torch.zeros_like(mask)
-    top, left, height, width = rows[0], columns[0], rows[-1] - rows[0] + 1, columns[-1] - columns[0] + 1
-    y, x = (int(edge - size // 2) for edge, size in ((top, height), (left, width)))
-    box[max(y, 0) : y + 2 * int(height), max(x, 0) : x + 2 * int(width)] = True
-    return box
-
-
-def _some(region: Bool[Tensor, "height width"], count: int, random: torch.Generator) -> Tensor:
-    pixels = region.reshape(-1).nonzero()[:, 0]
-    return pixels[torch.randperm(len(pixels), generator=random)[:count]]
+def _crossed(axes: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """By each axis of rotation, as columns: axis × vector."""
+    return torch.linalg.cross(axes, vectors[:, None]).transpose(1, 2)

@@ -93,7 +93,8 @@ def _jumps(buffers: Buffers, axis: int) -> _Pairs:
     near, far = torch.where(t[first] < t[second], torch.stack([first, second]), torch.stack([second, first]))
     near, far = near[t[near].isfinite()], far[t[near].isfinite()]
     rays, normals = buffers.rays.detach().flat(), buffers.normal.detach().reshape(-1, 3)
-    pairs = _Pairs(near, far, _aside(near, shape, -3 - axis), torch.ones_like(t[near]), t[near])
+    other = -3 - axis  # of the last two
+    pairs = _Pairs(near, far, _aside(near, shape, other), torch.ones_like(t[near]), t[near])
     before = rays[near].at(t[near]) - rays[far].at(t[far])
     unexplained = (before * normals[far]).sum(-1) > UNEXPLAINED * pairs.apart(rays)[0].norm(dim=-1)
     return pairs[unexplained | t[far].isinf()]

@@ -47,6 +47,28 @@ def growth(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: s
     return _drawn(chart)
 
 
+def courses(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: str) -> Html:
+    """How values fall with x, both on logarithmic axes; the end of each is marked."""
+    chart, axes = _empty("both")
+    for i, (name, points) in enumerate(series.items()):
+        colour = PALETTE[i % len(PALETTE)]
+        axes.plot(list(points), list(points.values()), label=_plain(name), color=colour, linewidth=1.8)
+        axes.plot(list(points)[-1:], list(points.values())[-1:], "o", color=colour)
+    axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
+    axes.legend(frameon=False)
+    return _drawn(chart)
+
+
+def steps_chart(series: Mapping[str, Mapping[str, float]], x_label: str, y_label: str) -> Html:
+    """Values over named steps, from zero."""
+    chart, axes = _empty("y")
+    for i, (name, points) in enumerate(series.items()):
+        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=PALETTE[i % len(PALETTE)])
+    axes.set(xlabel=x_label, ylabel=y_label, ylim=(0, None))
+    axes.legend(frameon=False)
+    return _drawn(chart)
+
+
 def bars(values: Mapping[str, float], x_label: str) -> Html:
     """One bar per name, from above, on a logarithmic axis, with its value beside it."""
     chart, axes = _empty("x", height=0.42 * len(values) + 0.9)

@@ -81,7 +81,7 @@ class Decoder(nn.Module):
         if code.shape != (self.specs.code_length,):
             takes = [self.specs.code_length]
             raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
-        return ShapeField(self, self._folded(code))
+        return ShapeField(self, self._folded(code), code)
 
     def _folded(self, code: Tensor) -> list[Layer]:
         """Each layer's weight without the code's columns, and its bias with what the code adds."""
@@ -118,10 +118,10 @@ class Decoder(nn.Module):
 
 
 class ShapeField:
-    """The field of one shape: a decoder whose layers have the shape's code folded in."""
+    """The field of one shape: a decoder whose layers have the shape's code folded in, if it is known which."""
 
-    def __init__(self, decoder: Decoder, layers: list[Layer]) -> None:
-        self.decoder, self.layers = decoder, layers
+    def __init__(self, decoder: Decoder, layers: list[Layer], code: Float[Tensor, "length"] | None = None) -> None:
+        self.decoder, self.layers, self.code = decoder, layers, code
         self.size = CPU_CHUNK if layers[0][0].device.type == "cpu" else GPU_CHUNK
         self.evaluate = chunked(lambda points: decoder._run(layers, points), self.size)
 

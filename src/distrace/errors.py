@@ -14,3 +14,12 @@ def explained(sentence: str) -> Iterator[None]:
         cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]  # of a library's explanation, the first sentence
         cause = f"no key {cause}" if isinstance(error, KeyError) else cause
         raise ValueError(f"{sentence} ({cause})" if cause else sentence) from error
+
+
+@contextmanager
+def about(subject: object) -> Iterator[None]:
+    """A `ValueError` inside is raised again with what it is about before it."""
+    try:
+        yield
+    except ValueError as error:
+        raise ValueError(f"{subject}: {error}") from error

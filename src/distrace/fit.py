@@ -94,10 +94,11 @@ def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
 def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig = FitConfig()) -> Iterator[Step]:
     """Fits a code to views. Of several starts the one of the least loss goes on; its last step is the result.
 
-    Raises `ValueError` without views.
+    Raises `ValueError` without views, or with one from inside the mean shape.
     """
     if not views:
         raise ValueError("no view was given; fitting needs at least one")
+    _check_outside(decoder.field(prior.mean), views, prior.mean.device)
     pools = [Pool.of(view) for view in views]
     runs, trials = [], []
     for start in range(config.starts):
@@ -107,6 +108,18 @@ def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: Fit
             trials.append(step)
         runs.append(run)
     yield from runs[_best(trials) if trials else 0]
+
+
+@torch.no_grad()
+def _check_outside(mean: SDF, views: Sequence[View], device: torch.device) -> None:
+    """From inside a shape nothing is hit, and nothing can be learnt."""
+    eyes = torch.stack([view.camera.T_world_camera[:3, 3] for view in views])
+    values = mean(eyes.to(device))
+    if (values < 0).any():
+        eye = [round(x, 3) for x in eyes[int(values.argmin())].tolist()]
+        raise ValueError(
+            f"the camera at {eye} is inside the mean shape; shapes are seen from outside, about the origin"
+        )
 
 
 def _best(trials: list[Step]) -> int:

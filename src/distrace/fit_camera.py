@@ -2,104 +2,133 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.alignment import Accuracy, Scene, Sight, residuals
+from distrace.alignment import Accuracy, Still, residuals
 from distrace.camera import Camera
 from distrace.data.view import View
-from distrace.field import SDF
+from distrace.field import SDF, Counted
 from distrace.pose import aimed, turned_object, zoomed
 from distrace.rays import meet_sphere
-from distrace.solver import Residuals, SolverConfig, minimise
+from distrace.sight import Sight, outline_of, rays_of
+from distrace.solver import Residuals, Solution, SolverConfig, minimise
 
-REFINE = 2
-GOOD = 0.01  # a loss below this: most rays agree within the accuracy
+AGREES = 0.01  # a start is good once no larger share of its rays is off by more than the accuracy
+AXES = ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))  # about which further starts are turned
+FRUITLESS = len(AXES)  # so many further starts that agree on no more rays are the last
+PATIENCE, PROGRESS = 5, 0.8  # a start whose loss falls by less in so many iterations is given up
+
+
+def _search() -> SolverConfig:
+    return SolverConfig(iterations=40, widest=30.0)
 
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Levenberg–Marquardt from several starts, one after another until one agrees with what was observed."""
+    """Levenberg–Marquardt from a start, and from that start turned, until one agrees with what was observed."""
 
-    rays: int = 450
-    focal: bool = False  # also the focal length
-    starts: int = 8
-    turn: float = 35.0  # degrees by which further starts are turned
+    rays: int = 240  # while searching …
+    outline_rays: int = 600  # … and at last, along the outline
+    focal: bool = False  # also find the focal length
+    starts: int = 13
+    turn: float = 30.0  # degrees, of the first six further starts; twice that of the next six
     accuracy: Accuracy = Accuracy()
-    solver: SolverConfig = field(default_factory=lambda: SolverConfig(iterations=40, widest=30.0))
+    search: SolverConfig = field(default_factory=_search)
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.starts < 1 or self.rays < 10:
+            raise ValueError(f"{self.starts} starts and {self.rays} rays were asked for; it takes at least 1 and 10")
 
 
 @dataclass(frozen=True)
 class CameraStep:
+    """The camera after an iteration; the last step's is the result."""
+
     start: int
     iteration: int
     camera: Camera
     loss: float
-    disagreeing: float
+    off: float  # the share of rays that are off by more than the accuracy
     seconds: float
+    evaluations: int  # of the field, so far
 
 
 def fit_camera(sdf: SDF, view: View, start: Camera, config: CameraConfig = CameraConfig()) -> Iterator[CameraStep]:
-    scene, sight = Scene.of(sdf, start.intrinsics), Sight.of(view, config.rays, config.seed)
-    start = _facing(start, sight)
+    """Finds the camera that sees a shape as it was observed; of `view`, nothing is used of where its camera is.
+
+    The shape is shifted before it is turned. Where no ray of the object meets the unit sphere, the start is turned to
+    face it. Of several starts the one that agrees on the most rays is refined along the outline.
+    Raises `ValueError` where nothing was observed.
+    """
+    search = _Search(Counted(sdf), view, config)
     best: CameraStep | None = None
-    for k, first in enumerate(_starts(start, config)):
-        for step in _descend(scene, sight, first, config, k):
+    for k, first in enumerate(_starts(search.facing(start), config)):
+        for step in search.descend(first, k):
             yield step
-            if best is None or step.disagreeing < best.disagreeing:
-                best = step
-        if best.disagreeing < GOOD:
+            best = step if best is None or step.off < best.off else best
+        if best is not None and (best.off < AGREES or k - best.start >= FRUITLESS):
             break
-    if view.mask is not None:
-        sight = Sight.of(view, REFINE * config.rays, config.seed + 1, width=3)
-        yield from _polish(scene, sight, best, config)
-    else:
-        yield best
+    assert best is not None
+    yield from search.refine(best)
 
 
-def _descend(scene, sight, first, config, k):
-    begins = first
-    shifted = None
-    for solution in minimise(
-        lambda camera: _only_shift(residuals(scene, sight, camera, config.accuracy, focal=False)),
-        first,
-        lambda camera, step: turned_object(camera, torch.zeros_like(step), step),
-        SolverConfig(iterations=4, widest=config.solver.widest, narrowing=1.0),
-    ):
-        begins = solution.state
-        yield CameraStep(k, solution.iteration, solution.state, solution.loss, _off(solution), solution.seconds)
-    losses = []
-    for solution in minimise(
-        lambda camera: residuals(scene, sight, camera, config.accuracy, focal=config.focal), begins, _moved, config.solver
-    ):
-        yield CameraStep(k, solution.iteration, solution.state, solution.loss, _off(solution), solution.seconds)
-        losses.append(solution.loss)
-        if len(losses) > 8 and _off(solution) > GOOD and losses[-1] > 0.8 * losses[-6]:
-            return
-        if _off(solution) < GOOD / 2:
-            return
+class _Search:
+    def __init__(self, sdf: Counted, view: View, config: CameraConfig) -> None:
+        self.sdf, self.view, self.config = sdf, view, config
+        self.shape = Still.of(sdf, view.camera.intrinsics)
+        self.rays = rays_of(view, config.rays, config.seed)
+        if not self.rays.is_object.any():
+            raise ValueError("the view shows nothing of the object; it needs a depth, a mask or normals")
+
+    def facing(self, start: Camera) -> Camera:
+        seen = self.rays.pixels[self.rays.is_object]
+        return start if meet_sphere(start.rays(seen)).meets.any() else aimed(start, seen.mean(0))
+
+    def descend(self, first: Camera, k: int) -> Iterator[CameraStep]:
+        """Shifts, then turns, too; ends early where rays agree, or where it leads nowhere."""
+        shift = replace(self.config.search, iterations=4, narrowing=1.0)
+        for found in minimise(lambda camera: _shifts(self.off(camera)), first, _shifted, shift):
+            first = found.state
+            yield self.step(k, found)
+        losses = []
+        for found in minimise(self.off, first, _moved, self.config.search):
+            step = self.step(k, found)
+            yield step
+            losses.append(step.loss)
+            lost = len(losses) > PATIENCE + 3 and losses[-1] > PROGRESS * losses[-1 - PATIENCE]
+            if step.off < AGREES / 2 or (lost and step.off > AGREES):
+                return
+
+    def refine(self, best: CameraStep) -> Iterator[CameraStep]:
+        """With more rays, and those along the outline that pass between pixels."""
+        view, count = self.view, self.config.rays
+        rays = rays_of(replace(view, mask=None), 2 * count, self.config.seed + 1)
+        if view.mask is not None:
+            rays = rays + outline_of(view.mask, view.camera.pixels(), self.config.outline_rays)
+        for found in minimise(
+            lambda camera: self.off(camera, rays), best.camera, _moved, SolverConfig(iterations=6, settled=1e-3)
+        ):
+            yield self.step(best.start, found)
+
+    def off(self, camera: Camera, rays: Sight | None = None) -> Residuals:
+        return residuals(self.shape, rays or self.rays, camera, self.config.accuracy, focal=self.config.focal)
+
+    def step(self, start: int, found: Solution[Camera]) -> CameraStep:
+        off = float(found.residuals.weights[found.residuals.values.abs() > 1].sum())
+        return CameraStep(start, found.iteration, found.state, found.loss, off, found.seconds, self.sdf.evaluations)
 
 
-def _polish(scene, sight, best, config):
-    for solution in minimise(
-        lambda camera: residuals(scene, sight, camera, config.accuracy, focal=config.focal),
-        best.camera,
-        _moved,
-        SolverConfig(iterations=10),
-    ):
-        yield CameraStep(best.start, best.iteration + solution.iteration, solution.state, solution.loss, _off(solution), solution.seconds)
+def _shifts(found: Residuals) -> Residuals:
+    return replace(found, jacobian=found.jacobian[:, 3:6])
 
 
-def _off(solution):
-    return float((solution.residuals.values.abs() > 1).sum() * solution.residuals.weights[:1].sum())
-
-
-def _only_shift(found):
-    return Residuals(found.values, found.jacobian[:, 3:6], found.weights)
+def _shifted(camera: Camera, shift: Float[Tensor, "3"]) -> Camera:
+    return turned_object(camera, torch.zeros_like(shift), shift)
 
 
 def _moved(camera: Camera, step: Float[Tensor, "unknowns"]) -> Camera:
@@ -109,16 +138,7 @@ def _moved(camera: Camera, step: Float[Tensor, "unknowns"]) -> Camera:
 
 def _starts(start: Camera, config: CameraConfig) -> Iterator[Camera]:
     yield start
-    angle = math.radians(config.turn)
     for k in range(config.starts - 1):
-        axis = torch.zeros(3, dtype=start.intrinsics.dtype)
-        sign = 1 if k % 2 == 0 else -1
-        axis[(1, 0, 2)[k // 2 % 3]] = sign * angle
-        yield turned_object(start, axis, torch.zeros_like(axis))
-
-
-def _facing(start: Camera, sight: Sight) -> Camera:
-    seen = sight.pixels[sight.is_object]
-    if meet_sphere(start.rays(seen)).meets.any():
-        return start
-    return aimed(start, seen.mean(0))
+        axis = start.intrinsics.new_tensor(AXES[k % len(AXES)])
+        angle = math.radians(config.turn) * (1 + k // len(AXES))
+        yield turned_object(start, axis * angle, torch.zeros_like(axis))

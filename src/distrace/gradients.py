@@ -19,7 +19,7 @@ from distrace.moves import Change, Move, Tally, all_moves, decoder_changes
 from distrace.primitives import box, sphere
 from distrace.rays import meet_sphere
 from distrace.render import Buffers
-from distrace.retrace import DOUBLE, View
+from distrace.retrace import DOUBLE, Retraced
 
 EXACT, QUERIES = "exact", (1, 3, 5)
 RADIUS = 0.5
@@ -88,7 +88,7 @@ def subjects(model: Model, code: int, size: int) -> list[Subject]:
 
 def ratio_rows(subject: Subject) -> Iterator[tuple[RatioRow, Float[Tensor, "height width"]]]:
     """Each parameter by each method, with the image of the ratio; NaN where there is none."""
-    view, rays = View.of(subject.sdf, subject.camera, 1.0, DOUBLE), subject.camera.rays()
+    view, rays = Retraced.of(subject.sdf, subject.camera, 1.0, DOUBLE), subject.camera.rays()
     marched = march(subject.sdf, rays, meet_sphere(rays), queries=max(QUERIES))
     missed = marched.distance[view.trace.hit].isinf()
     here = view.hits_anew(subject.sdf, subject.camera)
@@ -105,7 +105,7 @@ def _moved(seen: See, move: Move, h: Tensor) -> Images:
     return seen(*move(h))
 
 
-def _methods(view: View, marched: Queries) -> dict[str, See]:
+def _methods(view: Retraced, marched: Queries) -> dict[str, See]:
     """Ways to a differentiable depth."""
     hit = view.trace.hit
 
@@ -118,7 +118,7 @@ def _methods(view: View, marched: Queries) -> dict[str, See]:
     return {EXACT: exact} | {f"DIST, k = {k}": partial(dist, k) for k in QUERIES}
 
 
-def _ratio_row(view: View, names: tuple[str, str, str], compared: Compared) -> tuple[RatioRow, Tensor]:
+def _ratio_row(view: Retraced, names: tuple[str, str, str], compared: Compared) -> tuple[RatioRow, Tensor]:
     error, (derivative, difference) = compared.error, (compared.derivative[:, 0], compared.difference[:, 0])
     kept = ~error.isnan()
     told = kept & (difference.abs() > SHARE * difference.abs().nanmedian())

@@ -95,28 +95,20 @@ def weight_change(network: nn.Module, *inputs: Tensor) -> Change:
 
 
 def own_changes(field: SDF) -> dict[str, Change]:
-    """The weights of a field that is a network, or one shape of a decoder; of other callables nothing is known."""
+    """The weights of a network, code and weights of one shape of a decoder; of other callables nothing is known."""
     if isinstance(field, nn.Module):
         return {"weights": weight_change(field)}
-    if not isinstance(field, ShapeField):
-        return {}
-    layers = [(weight.detach(), bias.detach()) for weight, bias in field.layers]
-    along = [(_direction(weight), _direction(bias)) for weight, bias in layers]
-
-    def change(h: Tensor) -> SDF:
-        moved = [(w + h * dw, b + h * db) for (w, b), (dw, db) in zip(layers, along, strict=True)]
-        return ShapeField(field.decoder, moved)
-
-    return {"weights": change}
+    if isinstance(field, ShapeField) and field.code is not None:
+        return decoder_changes(field.decoder, field.code)
+    return {}
 
 
 def in_double(field: SDF) -> SDF:
     """The same field in float64, where it is a network or one shape of a decoder; others as they are."""
     if isinstance(field, nn.Module):
-        return deepcopy(field).double()
-    if isinstance(field, ShapeField):
-        layers = [(weight.detach().double(), bias.detach().double()) for weight, bias in field.layers]
-        return ShapeField(deepcopy(field.decoder).double(), layers)
+        return deepcopy(field).double().requires_grad_(False)
+    if isinstance(field, ShapeField) and field.code is not None:
+        return in_double(field.decoder).field(field.code.detach().double())
     return field
 
 

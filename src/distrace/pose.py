@@ -28,8 +28,8 @@ def turned_object(camera: Camera, rotation_vector: Float[Tensor, "3"], shift: Fl
     """The camera that sees the object turned about its middle, by an axis times an angle in the camera's axes, and
     then shifted."""
     rotation, translation = object_in_camera(camera)
-    turned = roma.special_procrustes(roma.rotvec_to_rotmat(rotation_vector) @ rotation)  # stays a rotation
-    return with_object_at(camera, turned, translation + shift)
+    turned: Tensor = roma.special_procrustes(roma.rotvec_to_rotmat(rotation_vector) @ rotation)  # pyright: ignore[reportAssignmentType]
+    return with_object_at(camera, turned, translation + shift)  # a rotation to rounding, after many turns, too
 
 
 def zoomed(camera: Camera, log_factor: Tensor) -> Camera:

@@ -38,7 +38,7 @@ SINGLE = Precision(torch.float32, step=2e-3, zero=1e-5, tolerance=5e-2, least=5e
 
 
 @dataclass(frozen=True)
-class View:
+class Retraced:
     """Where the rays of a camera hit a field, and where the others come closest to it."""
 
     trace: Trace
@@ -49,7 +49,7 @@ class View:
     precision: Precision
 
     @staticmethod
-    def of(sdf: SDF, camera: Camera, radius: float, precision: Precision) -> "View":
+    def of(sdf: SDF, camera: Camera, radius: float, precision: Precision) -> "Retraced":
         """Raises `ValueError` where the camera sees nothing of the shape."""
         rays = camera.rays()
         bounds = meet_sphere(rays, radius)
@@ -63,7 +63,7 @@ class View:
         rough = surface.minimum(sdf, missing, trace.closest[passing], within)
         closest = surface.minimum(sdf, missing, rough, within, reach=EDGE, refine=2 * ROUNDS)
         outside = (closest - within.near < EDGE) | (within.far - closest < EDGE)
-        return View(trace, slope, passing, closest.masked_fill(outside, torch.nan), radius, precision)
+        return Retraced(trace, slope, passing, closest.masked_fill(outside, torch.nan), radius, precision)
 
     def attached(self, sdf: SDF, camera: Camera) -> Images:
         """By the renderer, from the trace as it was: differentiable."""

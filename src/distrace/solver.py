@@ -30,7 +30,7 @@ class SolverConfig:
 
     def __post_init__(self) -> None:
         if self.iterations < 1 or not self.scale > 0 or not self.widest >= 1:
-            raise ValueError(f"{self} solves nothing: it needs an iteration, a positive scale and a widest of at least 1")
+            raise ValueError(f"{self} solves nothing; it takes an iteration, a positive scale and a widest of 1 or more")
 
     def scale_at(self, iteration: int) -> float:
         return self.scale * max(1.0, self.widest * self.narrowing**iteration)

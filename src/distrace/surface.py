@@ -98,7 +98,7 @@ def least(
         value = sdf(rays.at(lowest))
     if not (_moves(rays) or _differentiable(sdf, rays.detach().at(lowest))):
         return value
-    beside = 2 * reach / 5 ** _rounds(lowest, refine)
+    beside = reach / 5 ** (_rounds(lowest, refine) - 1)  # where the last round looked: the corner is between
     sides = torch.stack([lowest - beside, lowest + beside])
     both = Rays(rays.origins.expand(2, *rays.origins.shape), rays.directions.expand(2, *rays.directions.shape))
     change, (falling, rising) = _change(sdf, both, sides)
@@ -109,7 +109,7 @@ def least(
 
 def _rounds(like: Tensor, refine: int | None) -> int:
     """Down to where rounding hides which side is lower."""
-    return (8 if like.dtype == torch.float64 else 4) if refine is None else refine
+    return (10 if like.dtype == torch.float64 else 4) if refine is None else refine
 
 
 @torch.no_grad()
@@ -138,7 +138,7 @@ def minimum(
         ray, middle, w, lowest, highest = flat[going], t[going], width[going], near[going], far[going]
         before, after = (middle - w).maximum(lowest), (middle + w).minimum(highest)
         left, right = sdf(ray.at(before)), sdf(ray.at(after))
-        curvature = (left - 2 * value[going] + right).clamp_min(1e-9)
+        curvature = (left - 2 * value[going] + right).clamp_min(torch.finfo(t.dtype).tiny)
         offset = 0.5 * w * (left - right) / curvature
         vertex = (middle + offset.clamp(-w, w)).clamp(lowest, highest)
         candidates = torch.stack([middle, before, after, vertex])

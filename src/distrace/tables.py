@@ -7,7 +7,7 @@ import numpy as np
 from distrace import shading
 from distrace.backward import Timing
 from distrace.bench import Row
-from distrace.charts import bars, growth
+from distrace.charts import bars, courses, growth
 from distrace.fields import FieldRow
 from distrace.gradients import RatioRow
 from distrace.growth import GrowthRow
@@ -15,6 +15,7 @@ from distrace.page import Html, figure, page, paragraph, ramp, section, short, t
 from distrace.page import row as beside
 from distrace.render import Buffers
 from distrace.shading import Picture
+from distrace.solvers import Curve, SolverRow
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")
 MOST_QUERIES, LARGEST_ERROR = 20.0, 1e-3
@@ -108,6 +109,21 @@ def gradients_page(rows: Sequence[RatioRow], ratios: Sequence[np.ndarray], timin
     )
 
 
+def solvers_page(measured: Sequence[tuple[SolverRow, Curve]]) -> str:
+    """How the loss falls with time, of each shape and number of depths by each solver."""
+    charts: dict[str, dict[str, dict[float, float]]] = {}
+    for row, curve in measured:
+        seen = f"{row.shape}, {row.points or 'all'} depths"
+        charts.setdefault(seen, {})[row.solver] = dict(zip(curve.seconds, curve.losses, strict=True))
+    lead = (
+        "Adam's loss, on rays that both are measured on and neither is told, from the mean shape on. Seconds leave"
+        " the measuring out; reached: when the loss was no more than Adam's last; ratio: that over Adam's seconds."
+    )
+    parts = [section(seen, courses(series, "seconds", "loss")) for seen, series in charts.items()]
+    rows = [row for row, _ in measured]
+    return page("Adam and Levenberg–Marquardt", lead, [section("Table", table(*_cells(rows))), *parts])
+
+
 def ratio_map(ratio: np.ndarray) -> Picture:
     """Grey is right, red too large, blue too small; white where there is nothing to compare."""
     doublings = np.log2(np.where(ratio > 0, ratio, np.where(np.isnan(ratio), np.nan, 2**-DOUBLINGS)))
@@ -124,7 +140,7 @@ def _charts(rows: Sequence[GrowthRow]) -> list[Html]:
 
 
 def _cells(
-    rows: Sequence[Row] | Sequence[GrowthRow] | Sequence[RatioRow] | Sequence[Timing],
+    rows: Sequence[Row] | Sequence[GrowthRow] | Sequence[RatioRow] | Sequence[Timing] | Sequence[SolverRow],
 ) -> tuple[list[str], list[list[str]]]:
     """Header and lines; counts with separators, small numbers in as few digits as tell."""
     lines = [{key: value for key, value in line.asdict().items() if key != "share"} for line in rows]

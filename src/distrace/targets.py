@@ -30,7 +30,7 @@ class Pool:
     """The pixels of a view that targets are drawn from, as flat indices."""
 
     view: View
-    with_depth: Tensor
+    with_depth: Tensor  # or with a normal, where that is all there is
     outline: Tensor
     anywhere: Tensor  # whose rays meet the unit sphere
 
@@ -39,7 +39,8 @@ class Pool:
         nothing = torch.empty(0, dtype=torch.int64)
         with_depth = view.seen.reshape(-1).nonzero()[:, 0]
         if view.mask is None:
-            return Pool(view, with_depth, nothing, nothing)
+            known = with_depth if len(with_depth) else view.observed.reshape(-1).nonzero()[:, 0]
+            return Pool(view, known, nothing, nothing)
         meets = meet_sphere(view.camera.rays()).meets
         outline, anywhere = ((region & meets).reshape(-1).nonzero()[:, 0] for region in (band(view.mask), meets))
         return Pool(view, with_depth, outline, anywhere)
@@ -49,8 +50,7 @@ class Pool:
         sets = ((self.with_depth, depth_rays), (self.outline, mask_rays // 2), (self.anywhere, mask_rays // 2))
         chosen = torch.cat([_draw(indices, count, random) for indices, count in sets])
         view = self.view
-        seen = view.seen.reshape(-1)[chosen]
-        is_object = seen if view.mask is None else seen | view.mask.reshape(-1)[chosen]
+        is_object = view.observed.reshape(-1)[chosen]
         normal = None if view.normal is None else view.normal.reshape(-1, 3)[chosen]
         pixels = view.camera.pixels().reshape(-1, 2)[chosen]
         return Targets(view.camera, pixels, view.depth.reshape(-1)[chosen], is_object, normal)

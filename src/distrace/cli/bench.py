@@ -7,11 +7,12 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from distrace import ablation, backward, fields, gradients, growth, tables
+from distrace import ablation, backward, fields, gradients, growth, solvers, tables
 from distrace.bench import measure, poster_view
 from distrace.checkpoint import Model
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
+from distrace.data.split import read_split
 from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 
@@ -29,15 +30,18 @@ SHORT: dict[str, str] = {
 class Bench:
     """Measure what tracing costs and how far it is off, against a reference that takes no chances."""
 
-    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients"]]
+    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients", "solvers"]]
     """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
     with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels;
-    gradients: exact and DIST's against finite differences, and the time of a backward pass"""
+    gradients: exact and DIST's against finite differences, and the time of a backward pass; solvers: how fast Adam and
+    Levenberg–Marquardt complete the held-out shapes"""
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
     size: int = 512  # pixels along each side, of `trace`, `fields` and the times of `gradients`
     repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
+    meshes: Path = Path("out/furniture")  # for `solvers`, as `distrace data furniture` makes it
+    split: str = "sofas"  # whose held-out shapes `solvers` completes
     device: str = "cpu"
 
     def run(self) -> None:
@@ -110,6 +114,20 @@ class Bench:
         show_table([{key: value for key, value in time.items() if key != "model"} for time in times])
         evaluations = sum(subject.tally.evaluations for subject in subjects)
         run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
+
+    def _solvers(self, run: Run, model: Model) -> None:
+        shapes, measured = read_split(self.split), []
+        count = sum(shape.split == "test" for shape in shapes) * len(solvers.POINTS) * 2
+        with progress("solvers", count) as bar:
+            for row, curve in solvers.solver_rows(model, shapes, self.meshes, solvers.RESOLUTION):
+                measured.append((row, curve))
+                bar.advance(f"{row.shape}, {row.points or 'all'} depths, {row.solver}: {row.loss:.4f}")
+        save_text(run.out / "index.html", tables.solvers_page(measured))
+        rows = [{"model": self.model, **row.asdict()} for row, _ in measured]
+        show_table([{key: value for key, value in row.items() if key not in HIDDEN} for row in rows])
+        courses = [{"seconds": curve.seconds, "losses": curve.losses} for _, curve in measured]
+        evaluations = sum(row["evaluations"] for row in rows)
+        run.finish({"rows": rows, "curves": courses, **origin(), "evaluations": evaluations})
 
 
 def _finish(run: Run, rows: list[dict[str, Any]]) -> None:

@@ -1,5 +1,6 @@
 """`complete` and `demo`: a whole shape from one depth view."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -18,6 +19,7 @@ from distrace.data.view import View, load_view
 from distrace.errors import explained
 from distrace.files import written
 from distrace.fit import FitConfig, Step, fit_shape, prior_of
+from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import Chamfer, chamfer
 from distrace.render import render
@@ -37,7 +39,7 @@ class Task:
     full: View  # all that was observed
     known: View  # what may be used of it
     truth: Surface | None
-    fit: FitConfig
+    fit: FitConfig | CodeFitConfig
     mesh: MeshConfig
 
 
@@ -64,7 +66,8 @@ class Complete:
     reference: Path | None = None  # the true surface, to measure against: a mesh or points (PLY)
     points: int | None = None  # use only so many of the depths, drawn at random
     ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
-    iterations: int = FitConfig.iterations
+    solver: Literal["adam", "lm"] = "adam"  # lm: Levenberg–Marquardt, in a fraction of the time
+    iterations: int | None = None  # by default 150 of Adam, or 15 of Levenberg–Marquardt
     starts: int = FitConfig.starts
     seed: int = 0
     resolution: int = 128  # of the mesh
@@ -72,7 +75,9 @@ class Complete:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        fit = FitConfig(iterations=self.iterations, starts=self.starts, seed=self.seed)
+        chosen = CodeFitConfig if self.solver == "lm" else FitConfig
+        iterations = chosen.iterations if self.iterations is None else self.iterations
+        fit = chosen(iterations=iterations, starts=self.starts, seed=self.seed)
         mesh = MeshConfig(self.resolution, device=run.device)
         full = load_view(self.observation)
         known = _known(full, self.points, self.ignore, self.seed)
@@ -135,11 +140,18 @@ def _complete(run: Run, task: Task) -> None:
 def _fitted(task: Task) -> Outcome:
     steps: list[Step] = []
     with progress("fitting", task.fit.total) as bar:
-        for step in fit_shape(task.model.decoder, [task.known], prior_of(task.model.codes), task.fit):
+        for step in _steps(task):
             steps.append(step)
             bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
     mesh = extract_mesh(task.model.field(steps[-1].code), task.mesh)
     return Outcome(steps, mesh, None if task.truth is None else chamfer(mesh, task.truth))
+
+
+def _steps(task: Task) -> Iterator[Step]:
+    decoder, views, prior = task.model.decoder, [task.known], prior_of(task.model.codes)
+    if isinstance(task.fit, CodeFitConfig):
+        return fit_code(decoder, views, prior, task.fit)
+    return fit_shape(decoder, views, prior, task.fit)
 
 
 def _story(task: Task, outcome: Outcome) -> report.Completion:

@@ -6,7 +6,7 @@ from typing import Literal
 
 import tyro
 
-from distrace import shading
+from distrace import pose_table, shading
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, save_json, start
 from distrace.data.split import read_split
@@ -25,9 +25,10 @@ from distrace.page import figure, page, section, table
 
 @dataclass(frozen=True)
 class Evaluate:
-    """Make a table of results: how well a model knows its training shapes, or completes the held-out ones."""
+    """Make a table of results: how well a model knows its training shapes or completes the held-out ones, or how often
+    a camera is found from one view."""
 
-    name: tyro.conf.Positional[Literal["training", "completion"]]
+    name: tyro.conf.Positional[Literal["training", "completion", "pose"]]
     model: ModelName = "sofas"
     split: str = "sofas"
     meshes: Path = Path("out/furniture")  # as `distrace data furniture` makes it
@@ -35,9 +36,33 @@ class Evaluate:
     points: int = 100  # observed depths, for completion
     seed: int = 0
     resolution: int = 256  # of the meshes that are compared
+    cameras: int = 50  # of `pose`, for each observation and each disturbance
+    jobs: int = 2  # processes, of `pose`
 
     def run(self) -> None:
         run = start(self.out)
+        if self.name == "pose":
+            self._pose(run)
+        else:
+            self._shapes(run)
+
+    def _pose(self, run: Run) -> None:
+        """What an earlier run has done is taken from its `trials.json`."""
+        opened(self.model, run.device)
+        kept = pose_table.read_trials(run.out / "trials.json")
+        known = {found.trial for found in kept}
+        wanted = [trial for trial in pose_table.all_trials(self.cameras) if trial not in known]
+        with progress("cameras", len(wanted)) as bar:
+            for found in pose_table.found_each(self.model, wanted, self.jobs):
+                kept.append(found)
+                save_json(run.out / "trials.json", [each.asdict() for each in kept])
+                bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")
+        rows = pose_table.rows_of(self.model, kept)
+        show_table(rows)
+        save_text(run.out / "index.html", pose_table.pose_page(self.model, rows))
+        run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in kept)})
+
+    def _shapes(self, run: Run) -> None:
         opened_model, shapes = opened(self.model, run.device), read_split(self.split)
         if self.name == "training":
             count = sum(shape.split == "train" for shape in shapes)

@@ -4,14 +4,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.data.arrays import camera_of, depth_image, mask_image, normal_image, read_arrays
+from distrace.data.checks import check_mask, check_normals, check_place
 from distrace.data.solid import Solid
-from distrace.errors import explained
+from distrace.errors import about
 from distrace.files import save_arrays
 from distrace.shading import Picture, shaded_picture
 
@@ -30,6 +31,12 @@ class View:
         """Where there is a depth."""
         return torch.isfinite(self.depth)
 
+    @property
+    def observed(self) -> Bool[Tensor, "height width"]:
+        """Where anything of the object is known: a depth, a normal, or that it is there."""
+        known = self.seen if self.mask is None else self.seen | self.mask
+        return known if self.normal is None else known | self.normal.any(-1)
+
     def points(self) -> Float[Tensor, "n 3"]:
         """The observed points, in the world."""
         rays = self.camera.rays()
@@ -42,6 +49,12 @@ class View:
             return None
         return shaded_picture(self.normal, self.mask, self.camera.rays().directions)
 
+    def masked(self, mask: Bool[Tensor, "height width"]) -> "View":
+        """The same view without the depths and normals outside of a mask."""
+        depth = self.depth.masked_fill(~mask, torch.inf)
+        normal = None if self.normal is None else self.normal.masked_fill(~mask[..., None], 0.0)
+        return replace(self, depth=depth, normal=normal)
+
     def sparse(self, count: int, seed: int = 0) -> "View":
         """The same view with only `count` of its depths, drawn at random."""
         chosen = torch.randperm(int(self.seen.sum()), generator=torch.Generator().manual_seed(seed))[:count]
@@ -52,20 +65,33 @@ class View:
 
 
 def load_view(path: Path) -> View:
-    """Reads `OBSERVATION.npz`. Raises `ValueError`, in one sentence, for what is missing or makes no sense."""
-    with explained(f"{path} is not an observation: an .npz with depth, intrinsics and T_world_camera"):
-        with np.load(path, allow_pickle=False) as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        depth = torch.from_numpy(arrays["depth"].astype(np.float32))
-        intrinsics = torch.from_numpy(arrays["intrinsics"].astype(np.float32))
-        pose = torch.from_numpy(arrays["T_world_camera"].astype(np.float32))
-    if depth.dim() != 2:
-        raise ValueError(f"{path}: depth has shape {list(depth.shape)}; an image [height, width] is needed")
-    with explained(f"{path} describes no camera"):
-        camera = Camera.from_matrices(intrinsics, pose, *depth.shape)
-    depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
-    view = View(camera, depth, _image(arrays, "mask", path, depth.shape), _image(arrays, "normal", path, depth.shape))
-    _check_units(view, path)
+    """Reads `OBSERVATION.npz`, of a camera that sees the unit sphere.
+
+    Raises `ValueError`, in one sentence, for what is missing or makes no sense.
+    """
+    view = read_view(path)
+    with about(path):
+        check_place(view.camera, view.depth, view.observed)
+    return view
+
+
+def read_view(path: Path) -> View:
+    """The same wherever the camera is. What lies outside of the mask is left out: it is not the object's."""
+    arrays = read_arrays(path)
+    with about(path):
+        depth = depth_image(arrays["depth"])
+        size = depth.shape[0], depth.shape[1]
+        camera = camera_of(arrays["intrinsics"], arrays["T_world_camera"], *size)
+        mask = mask_image(arrays["mask"], *size) if "mask" in arrays else None
+        normal = normal_image(arrays["normal"], *size) if "normal" in arrays else None
+        view = View(camera, depth, mask, normal)
+        if mask is not None:
+            check_mask(mask, view.seen)
+            view = view.masked(mask)
+        if not view.observed.any():
+            raise ValueError("it shows nothing: no depth is finite and positive, and no pixel is marked as object")
+        if view.normal is not None:
+            check_normals(camera, view.normal)
     return view
 
 
@@ -89,23 +115,3 @@ def observe(solid: Solid, camera: Camera) -> View:
     shape = (camera.height, camera.width)
     depth = depth.reshape(shape)
     return View(camera, depth, torch.isfinite(depth), normal.reshape(*shape, 3))
-
-
-def _image(arrays: dict[str, np.ndarray], name: str, path: Path, shape: torch.Size) -> Tensor | None:
-    if name not in arrays:
-        return None
-    wanted = [*shape, 3] if name == "normal" else list(shape)
-    if list(arrays[name].shape) != wanted:
-        raise ValueError(f"{path}: {name} has shape {list(arrays[name].shape)}; beside this depth it must be {wanted}")
-    return torch.from_numpy(arrays[name].astype(np.float32 if name == "normal" else bool))
-
-
-def _check_units(view: View, path: Path) -> None:
-    if not view.seen.any() and (view.mask is None or not view.mask.any()):
-        raise ValueError(f"{path} shows nothing: no depth is finite and positive, and no pixel is marked as object")
-    farthest = view.points().norm(dim=-1).median() if view.seen.any() else torch.tensor(0.0)
-    if farthest > 3:
-        raise ValueError(
-            f"{path}: its points lie {farthest:.3g} from the origin, in the median; depth must be in the units of the"
-            " unit sphere that holds the shape (metres or millimetres need scaling, and T_world_camera with them)"
-        )

@@ -1,0 +1,114 @@
+"""`pose`: the camera of one view of a known shape."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+import tyro
+
+from distrace import shading
+from distrace.camera import Camera
+from distrace.checkpoint import Model
+from distrace.cli.common import Flag, ModelName, opened
+from distrace.cli.console import Run, console, progress, start
+from distrace.data.view import View, read_view, save_view
+from distrace.errors import explained
+from distrace.fit_camera import CameraConfig, CameraStep, fit_camera
+from distrace.pose import pose_error, turned_object
+from distrace.render import render
+
+FRAMES = 8  # of the film strip
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Find the camera that sees a shape as it was observed: from depth, silhouette, normals, or all of them.
+
+    The search starts from the observation's own T_world_camera, or from where --azimuth, --elevation and --distance
+    put it.
+    """
+
+    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
+    out: Path = Path("out/pose")
+    code: str = "0"  # which training shape, or a file that `complete` wrote: code.npy
+    ignore: tuple[Literal["depth", "mask", "normal"], ...] = ()  # parts of the observation to leave out
+    focal: Flag = False  # also find the focal length
+    azimuth: float | None = None  # degrees
+    elevation: float = 20.0  # degrees
+    distance: float = 4.97  # of the camera from the origin
+    disturb: float | None = None  # degrees by which the start is turned, to try how well it is found again
+    starts: int = CameraConfig.starts
+    seed: int = 0
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        model, observed = opened(self.model, run.device), read_view(self.observation)
+        model.decoder.requires_grad_(False)
+        field = model.field(_code(model, self.code))
+        first = self._start(observed.camera)
+        steps = []
+        with progress("fitting", 0) as bar:
+            config = CameraConfig(starts=self.starts, focal=self.focal, seed=self.seed)
+            for step in fit_camera(field, _without(observed, self.ignore), first, config):
+                steps.append(step)
+                bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}, {step.off:.1%} of the rays off")
+        last = steps[-1]
+        save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
+        chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
+        shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
+        self._finish(run, observed, steps)
+
+    def _start(self, camera: Camera) -> Camera:
+        if self.azimuth is not None:
+            around = Camera.orbit(self.azimuth, self.elevation, self.distance, focal_px=float(camera.intrinsics[0, 0]))
+            camera = replace(camera, T_world_camera=around.T_world_camera)
+        if self.disturb is None:
+            return camera
+        axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed))
+        return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros(3))
+
+    def _finish(self, run: Run, observed: View, steps: list[CameraStep]) -> None:
+        last = steps[-1]
+        facts = {
+            "T_world_camera": last.camera.T_world_camera.tolist(),
+            "intrinsics": last.camera.intrinsics.tolist(),
+            "share_of_rays_off": last.off,
+            "loss": last.loss,
+            "starts": max(step.start for step in steps) + 1,
+            "iterations": len(steps),
+            "evaluations": last.evaluations,
+            "setup_evaluations": 0,
+        }
+        degrees, percent = pose_error(last.camera, observed.camera)
+        facts |= {"degrees_from_observation": degrees, "percent_from_observation": percent}
+        console.print(
+            f"{last.off:.1%} of the rays are off; {degrees:.3f}° and {percent:.3f} % from the observation's own pose"
+        )
+        run.finish(facts)
+
+
+def _code(model: Model, given: str) -> int | torch.Tensor:
+    if given.isdecimal():
+        return int(given)
+    with explained(f"--code {given} is neither the number of a training shape nor a code.npy"):
+        return torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
+
+
+def _without(view: View, ignore: tuple[str, ...]) -> View:
+    depth = torch.full_like(view.depth, torch.inf) if "depth" in ignore else view.depth
+    return replace(view, depth=depth, **{name: None for name in ignore if name != "depth"})
+
+
+def _filmstrip(field, observed: View, steps: list[CameraStep]) -> shading.Picture:
+    """The observed mask and the rendered one, from the start to the end; below, what is rendered."""
+    mask = observed.seen if observed.mask is None else observed.mask
+    picked = [steps[round(k * (len(steps) - 1) / (FRAMES - 1))] for k in range(min(FRAMES, len(steps)))]
+    with torch.no_grad():
+        views = [render(field, step.camera) for step in picked]
+    compared = [shading.mask_comparison(mask, view.mask) for view in views]
+    shaded = [shading.shaded_picture(view.normal, view.mask, view.rays.directions) for view in views]
+    return shading.grid([compared, shaded])

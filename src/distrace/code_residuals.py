@@ -1,0 +1,162 @@
+"""What the shape of a code lacks of observed views: residuals on rays, and their exact derivatives by the code."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.field import Counted
+from distrace.fit import Prior
+from distrace.losses import Weights
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.solver import Residuals
+from distrace.surface import minimum
+from distrace.targets import Targets
+from distrace.trace import TraceConfig, sphere_trace
+
+BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
+ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
+REACH, ROUNDS = 0.05, 2  # … to two thousandths
+SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
+PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What deviations count: squared up to `scale`, where they weigh as in Adam's loss; the prior weighs as there."""
+
+    weights: Weights = Weights()
+    margin: float = 0.005  # how far the surface is to stay from rays of the background
+    scale: float = 0.1
+    trace: TraceConfig = field(
+        default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
+    )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Rays of all views, and what was seen there. A weight is a ray's share of its term of the loss."""
+
+    rays: Rays
+    bounds: Bounds
+    observed: Float[Tensor, "n"]  # distance; `inf` where unknown
+    is_object: Bool[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+
+    @staticmethod
+    def of(targets: Sequence[Targets], weights: Weights) -> "Seen":
+        parts = []
+        for target in targets:
+            rays, known = target.camera.rays(target.pixels), target.depth.isfinite()
+            depth, mask = weights.depth / max(int(known.sum()), 1), weights.mask / max(len(known), 1)
+            share = torch.where(known, depth, mask) / len(targets)
+            observed = target.depth / target.camera.cosines(target.pixels)
+            parts.append((rays.origins, rays.directions, observed, target.is_object, share))
+        origins, directions, observed, is_object, share = (torch.cat(part) for part in zip(*parts))
+        rays = Rays(origins, directions)
+        return Seen(rays, meet_sphere(rays), observed, is_object, share)
+
+    @property
+    def known(self) -> Bool[Tensor, "n"]:
+        return self.observed.isfinite()
+
+    def some(self, which: Tensor) -> tuple[Rays, Bounds]:
+        return self.rays[which], Bounds(self.bounds.near[which], self.bounds.far[which])
+
+
+@dataclass(frozen=True)
+class Look:
+    """Code coordinates, and where along the rays their shape is compared with what was seen."""
+
+    w: Float[Tensor, "dimensions"]
+    distance: Float[Tensor, "n"]
+    hit: Bool[Tensor, "n"]
+    compared: Bool[Tensor, "n"]
+
+
+@dataclass
+class Problem:
+    """Residuals of a code's coordinates on fixed rays; and how often all that has asked for the field."""
+
+    decoder: Decoder
+    prior: Prior
+    seen: Seen
+    config: Comparison
+    evaluations: int = 0
+
+    @torch.no_grad()
+    def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
+        """Rays are followed from where they ended last; those with a depth no farther than that.
+
+        Of the others those that disagree with the mask are compared, where the field is least.
+        """
+        seen, sdf = self.seen, Counted(self.decoder.field(self.prior.code(w)))
+        known, bounds = seen.known, Bounds(seen.bounds.near, seen.bounds.far.minimum(seen.observed))
+        begin = None if last is None else torch.where(last.hit | known, last.distance - BACK, bounds.near)
+        trace = sphere_trace(sdf, seen.rays, bounds, self.config.trace, begin)
+        t = torch.where(trace.hit | ~known, trace.closest, seen.observed)
+        free = ~known & ~seen.is_object & seen.bounds.meets
+        aside = (free & ~trace.hit).nonzero()[:, 0]
+        free[aside] = sdf(seen.rays[aside].at(t[aside])) < ATTENTION
+        lacking = ~known & seen.is_object & seen.bounds.meets & ~trace.hit
+        wrong = free | lacking
+        rays, limits = seen.some(wrong)
+        t[wrong] = minimum(sdf, rays, t[wrong], limits, reach=REACH, refine=ROUNDS)
+        self.evaluations += sdf.evaluations
+        return Look(w, t, trace.hit, known | wrong)
+
+    def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
+        return self.look(look.w + step, look)
+
+    def residuals(self, look: Look) -> Residuals:
+        """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
+
+        Of a depth that is the field at the observed point or, where the surface hides that, (t − t_observed) · |∇f · v|
+        at the hit; of an object ray that misses the least value; of a ray of the background what that lacks to the
+        margin. All change with the code as f does at a fixed point.
+        """
+        seen, rows = self.seen, look.compared.nonzero()[:, 0]
+        rays, t = seen.rays[rows], look.distance[rows]
+        values, gradient, by_code = derivatives(self.decoder, rays.at(t), self.prior.code(look.w))
+        self.evaluations += len(values)
+        slope = (gradient * rays.directions).sum(-1).abs()
+        before = torch.where(seen.known[rows], t - seen.observed[rows], 0.0)
+        lacking = torch.where(seen.is_object[rows], values.clamp_min(0), (values - self.config.margin).clamp_max(0))
+        values = torch.where(seen.known[rows], values + before * slope, lacking)
+        jacobian = (by_code @ self.prior.basis).masked_fill((values == 0)[:, None], 0.0)
+        count, own = len(look.w), SMALL * look.w
+        own_weight = values.new_full((count,), 2 * self.config.weights.code / count / SMALL**2)
+        return Residuals(
+            torch.cat([values, own]),
+            torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
+            torch.cat([seen.weights[rows] / self.config.scale, own_weight]),
+        )
+
+    def terms(self, look: Look, residuals: Residuals) -> dict[str, float]:
+        """The parts of Adam's loss, its depths measured from the surface: what of all scales can be compared."""
+        rows = look.compared.nonzero()[:, 0]
+        known, is_object = self.seen.known[rows], self.seen.is_object[rows]
+        lacking = residuals.values[: len(rows)].abs() * self.seen.weights[rows]
+        kinds = {"depth": known, "missing": ~known & is_object, "extra": ~known & ~is_object}
+        code = self.config.weights.code * look.w.square().mean()
+        return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
+
+
+def derivatives(
+    decoder: Decoder, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
+    """Values, and their derivatives by the point and by the code: every point has a copy of the code for its own."""
+    parts = [_derivatives(decoder, part, code) for part in points.split(PART)]
+    values, by_point, by_code = (torch.cat(part) for part in zip(*parts))
+    return values, by_point, by_code
+
+
+@torch.enable_grad()
+def _derivatives(decoder: Decoder, points: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    points, codes = points.detach().requires_grad_(), code.detach().repeat(len(points), 1).requires_grad_()
+    values = decoder(points, codes)
+    by_point, by_code = torch.autograd.grad(values.sum(), (points, codes))
+    return values.detach(), by_point, by_code

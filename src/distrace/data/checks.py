@@ -1,0 +1,119 @@
+"""Whether a camera and what it saw can be of a shape in the unit sphere; if not, what else they may be meant to be."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from distrace.camera import Camera
+
+WIDEST = 160.0  # degrees that a pinhole camera may see
+OBLONG = 4.0  # times that a pixel may be as long as wide
+COARSER = 2.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
+RATHER = 0.02  # as frequent: a mask with so few of the depths within is none of this object
+ALMOST = 1.2  # radii: what lies so far from the middle, in the median, is no shape in the unit sphere
+MOST = 100_000  # pixels that are looked at
+
+
+def check_intrinsics(camera: Camera) -> None:
+    """Raises `ValueError` where they are no pinhole camera's of this image."""
+    size, across = camera.intrinsics.new_tensor([camera.width, camera.height]), camera.intrinsics
+    (fx, fy), middle = across.diagonal()[:2].tolist(), across[:2, 2] / size
+    image = f"an image of {camera.height} × {camera.width} pixels"
+    angle = torch.rad2deg(2 * torch.atan(camera.width / (2 * across[0, 0]))).item()
+    if angle > WIDEST:
+        raise ValueError(f"a focal length of {fx:.4g} pixels sees {angle:.0f}° in {image}; intrinsics are in pixels")
+    if not 1 / OBLONG < fx / fy < OBLONG:
+        raise ValueError(f"focal lengths of {fx:.4g} and {fy:.4g} pixels were given; they cannot differ so much")
+    if middle.min() > COARSER / 2 and (middle[0] / middle[1]).log().abs() < 0.1:
+        point = " × ".join(f"{2 * length:.4g}" for length in across[:2, 2].flip(0).tolist())
+        raise ValueError(f"the intrinsics are for an image of {point} pixels, and depth is {image}; scale them with it")
+
+
+def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height width"]) -> None:
+    """Raises `ValueError` where depth is known of next to nothing but background."""
+    if not seen.any():
+        return
+    within, beyond = (seen & mask).sum().item(), (seen & ~mask).sum().item()
+    inside, outside = mask.sum().item(), (~mask).sum().item()
+    if not inside:
+        raise ValueError(f"mask marks no pixel as object, but {beyond} have a depth; mark the object, or leave it out")
+    if within / inside < RATHER * beyond / max(outside, 1):
+        raise ValueError(
+            f"mask marks {inside} pixels as object, of which {within} have a depth, as have {beyond} of the {outside}"
+            " others; is it inverted, or of another image?"
+        )
+
+
+def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> None:
+    """Raises `ValueError` where most of what is seen turns its back to the camera."""
+    known = _spread(normal.any(-1))
+    directions = camera.rays(camera.pixels()[known]).directions
+    facing = ((normal[known] * directions).sum(-1) < 0).float().mean()
+    if facing < 0.5:
+        raise ValueError(
+            f"normal points away from the camera at {1 - facing:.0%} of the pixels; it points out of the shape, in the"
+            " axes of the world, not of the camera"
+        )
+
+
+def check_place(camera: Camera, depth: Float[Tensor, "height width"], observed: Bool[Tensor, "height width"]) -> None:
+    """Raises `ValueError` where what was observed is not in the unit sphere, or the camera does not see that."""
+    chosen = _spread(depth.isfinite() if depth.isfinite().any() else observed)
+    pixels, depth = camera.pixels()[chosen], depth[chosen]
+    away = _away(camera, pixels, depth)
+    if away <= ALMOST:
+        return
+    what = "its points lie" if depth.isfinite().any() else "the rays of the object pass"
+    there = camera.T_world_camera[:3, 3].norm()
+    raise ValueError(
+        f"{what} {away:.3g} from the origin in the median, and the camera {there:.3g}, but the shape must be in the"
+        f" unit sphere around the origin; {_hint(camera, pixels, depth)}"
+    )
+
+
+def _away(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> float:
+    """From the origin, in the median: the points, or where there is no depth the rays."""
+    rays = camera.rays(pixels)
+    nearest = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
+    distance = torch.where(depth.isfinite(), depth / camera.cosines(pixels), nearest)
+    return rays.at(distance).norm(dim=-1).median().item()
+
+
+def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> str:
+    """What would explain it best, if that explains it."""
+    away, hint = min((_away(other, pixels, depth), hint) for hint, other in _others(camera).items())
+    if away <= ALMOST:
+        return hint
+    if not depth.isfinite().any():
+        return "T_world_camera maps camera axes (x right, y down, z forward) to the world: turn it to the shape"
+    return (
+        f"depth ({depth.median():.4g} in the median) and T_world_camera must be in the units of the unit sphere (metres"
+        " or millimetres need scaling), and a background needs a mask"
+    )
+
+
+def _others(camera: Camera) -> dict[str, Camera]:
+    """What is often given in place of the camera that is meant."""
+    pose, centred = camera.T_world_camera, camera.intrinsics.clone()
+    inverse, upward = torch.linalg.inv(pose), torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    centred[:2, 2] = centred.new_tensor([camera.width, camera.height]) / 2
+    means = "it maps camera axes (x right, y down, z forward) to the world"
+    poses = {"the inverse, T_camera_world": inverse, "in OpenGL's axes": pose @ upward}
+    poses["the inverse in OpenGL's axes"] = inverse @ upward
+    others = {
+        f"T_world_camera seems to be {what}: {means}": replace(camera, T_world_camera=poses[what]) for what in poses
+    }
+    others["the intrinsics seem to be of another image: look at the principal point"] = replace(
+        camera, intrinsics=centred
+    )
+    return others
+
+
+def _spread(chosen: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """At most MOST pixels of those, evenly spread."""
+    pixels = chosen.reshape(-1).nonzero()[:, 0]
+    some = torch.zeros_like(chosen).reshape(-1)
+    some[pixels[:: -(-len(pixels) // MOST) or 1]] = True
+    return some.reshape(chosen.shape)

@@ -1,0 +1,193 @@
+"""Fitting a code by Levenberg–Marquardt, with an untrained decoder whose shapes are bumpy balls."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import nn
+
+from distrace.camera import Camera
+from distrace.code_residuals import Comparison, Problem, Seen, derivatives
+from distrace.data.view import View
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.fit import Prior, Step
+from distrace.fit_code import CodeFitConfig, fit_code
+from distrace.losses import Weights
+from distrace.render import render
+from distrace.solver import SolverConfig, minimise
+from distrace.targets import Pool
+
+CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
+PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
+TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
+CONFIG = CodeFitConfig(starts=1, compared=Comparison(weights=Weights(code=1e-6)))
+
+
+@pytest.fixture(scope="module")
+def decoder() -> Decoder:
+    """About the distance to a ball before any training (Atzmon and Lipman, *SAL*, CVPR 2020); codes bend it."""
+    decoder = Decoder(NetworkSpecs(dims=(64,) * 3, code_length=4, latent_in=(), norm_layers=()))
+    generator = torch.Generator().manual_seed(0)
+    linears = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
+    with torch.no_grad():
+        for linear in linears[:-1]:
+            linear.weight.normal_(0, (2 / linear.out_features) ** 0.5, generator=generator)
+            linear.bias.zero_()
+        linears[0].weight[:, :4] *= 0.4
+        linears[-1].weight.normal_((torch.pi / linears[-1].in_features) ** 0.5, 1e-5, generator=generator)
+        linears[-1].bias.fill_(-0.6)
+    return decoder.requires_grad_(False)
+
+
+@pytest.fixture(scope="module")
+def view(decoder: Decoder) -> View:
+    """What the camera sees of the shape of the true code."""
+    buffers = render(decoder.field(TRUE), CAMERA)
+    assert 200 < buffers.mask.sum() < 1400, "it is neither small nor all that there is"
+    return View(CAMERA, buffers.depth, buffers.mask)
+
+
+def last(steps: Iterator[Step]) -> Step:
+    *_, step = steps
+    return step
+
+
+def problem_of(decoder: Decoder, view: View, compared: Comparison) -> Problem:
+    targets = Pool.of(view).draw(200, 200, torch.Generator().manual_seed(0))
+    return Problem(decoder, PRIOR, Seen.of([targets], compared.weights), compared)
+
+
+def error(decoder: Decoder, code: torch.Tensor) -> float:
+    """How far the surface of a code is from that of the true one, where the camera sees it."""
+    with torch.no_grad():
+        buffers = render(decoder.field(TRUE), CAMERA)
+        return float(decoder.field(code)(buffers.points).abs().mean())
+
+
+def test_derivatives_are_those_of_finite_differences(decoder: Decoder) -> None:
+    exact = Decoder(decoder.specs).double().requires_grad_(False)
+    exact.load_state_dict(decoder.state_dict())
+    random = torch.Generator().manual_seed(1)
+    points = torch.rand(2500, 3, generator=random, dtype=torch.float64) - 0.5
+    code, direction = torch.rand(2, 4, generator=random, dtype=torch.float64)
+    moved = torch.rand(3, generator=random, dtype=torch.float64)
+    values, by_point, by_code = derivatives(exact, points, code)
+    torch.testing.assert_close(values, exact.field(code)(points))
+    small = 1e-7
+    for found, ahead, behind in (
+        (by_code @ direction, (points, code + small * direction), (points, code - small * direction)),
+        (by_point @ moved, (points + small * moved, code), (points - small * moved, code)),
+    ):
+        expected = (exact(*ahead) - exact(*behind)) / (2 * small)
+        torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-6)
+
+
+def test_residuals_change_as_their_jacobian_says(decoder: Decoder, view: View) -> None:
+    """Each on rays that are compared before and after: of those by the field at the same point, exactly."""
+    problem = problem_of(decoder, view, CONFIG.compared)
+    random = torch.Generator().manual_seed(2)
+    w, step = torch.randn(4, generator=random), 1e-3 * torch.randn(4, generator=random)
+    before, after = problem.look(w), problem.look(w + step)
+    one, other = problem.residuals(before), problem.residuals(after)
+    rows, others = (look.compared.nonzero()[:, 0].tolist() for look in (before, after))
+    both = [row for row in rows if row in others and before.hit[row] == after.hit[row]]
+    assert len(both) > 150
+    change = other.values[[others.index(row) for row in both]] - one.values[[rows.index(row) for row in both]]
+    expected = one.jacobian[[rows.index(row) for row in both]] @ step
+    assert (change - expected).abs().median() < 0.05 * expected.abs().median()
+    assert one.jacobian.shape == (len(rows) + 4, 4), "the prior's rows are the last"
+
+
+def test_an_observed_shape_lacks_nothing(decoder: Decoder, view: View) -> None:
+    problem = problem_of(decoder, view, Comparison(margin=0.0))
+    look = problem.look(torch.linalg.solve(PRIOR.basis, TRUE - PRIOR.mean))
+    terms = problem.terms(look, problem.residuals(look))
+    assert terms["depth"] < 0.01, "ten times the mean error"
+    assert terms["missing"] + terms["extra"] < 1e-3
+    assert problem.evaluations > 1000
+
+
+def test_the_shape_of_another_code_is_found_in_a_few_steps(decoder: Decoder, view: View) -> None:
+    steps = list(fit_code(decoder, [view.sparse(100)], PRIOR, CONFIG))
+    assert error(decoder, PRIOR.mean) > 0.03
+    assert error(decoder, steps[-1].code) < 2e-3
+    torch.testing.assert_close(steps[-1].code, TRUE, atol=0.03, rtol=0)
+    assert [step.iteration for step in steps] == list(range(1, len(steps) + 1))
+    assert len(steps) <= CONFIG.total
+    assert set(steps[-1].terms) == {"depth", "missing", "extra", "code"}
+    assert steps[-1].loss == pytest.approx(sum(steps[-1].terms.values()))
+    assert steps[-1].loss < 0.1 * steps[0].loss
+    assert all(step.evaluations > 0 and step.seconds > 0 for step in steps)
+
+
+def test_continuing_from_the_last_hits_finds_what_a_whole_march_finds(decoder: Decoder, view: View) -> None:
+    problem = problem_of(decoder, view, CONFIG.compared)
+    w = torch.tensor([0.5, -0.2, 0.3, 0.1])
+    start = problem.look(torch.zeros(4))
+    before = problem.evaluations
+    continued = problem.moved(start, w)
+    between = problem.evaluations
+    anew = problem.look(w)
+    assert (continued.hit == anew.hit).float().mean() > 0.99
+    both = continued.hit & anew.hit & continued.compared & anew.compared
+    torch.testing.assert_close(continued.distance[both], anew.distance[both], atol=5e-3, rtol=0)
+    assert between - before < problem.evaluations - between, "at fewer evaluations"
+
+
+def test_without_a_mask_the_depths_tell(decoder: Decoder, view: View) -> None:
+    step = last(fit_code(decoder, [replace(view, mask=None)], PRIOR, CONFIG))
+    assert error(decoder, step.code) < 2e-3
+    assert step.terms["missing"] == step.terms["extra"] == 0
+
+
+def test_a_silhouette_alone_tells_much(decoder: Decoder, view: View) -> None:
+    silhouette = replace(view, depth=torch.full_like(view.depth, torch.inf))
+    step = last(fit_code(decoder, [silhouette], PRIOR, CONFIG))
+    with torch.no_grad():
+        wrong, mean = ((render(decoder.field(code), CAMERA).mask ^ view.mask).sum() for code in (step.code, PRIOR.mean))
+    assert wrong < 0.2 * mean
+    assert step.terms["depth"] == 0
+
+
+def test_two_views_tell_more(decoder: Decoder, view: View) -> None:
+    camera = Camera.orbit(150, -10, 2.5, height=40, width=40, focal_px=40.0)
+    buffers = render(decoder.field(TRUE), camera)
+    views = [view.sparse(20), View(camera, buffers.depth, buffers.mask).sparse(20)]
+    step = last(fit_code(decoder, views, PRIOR, CONFIG))
+    torch.testing.assert_close(step.code, TRUE, atol=0.03, rtol=0)
+
+
+def test_the_best_of_several_starts_goes_on(decoder: Decoder, view: View) -> None:
+    config = replace(CONFIG, iterations=7, starts=3, trial=2)
+    steps = list(fit_code(decoder, [view], PRIOR, config))
+    assert [(step.start, step.iteration) for step in steps[:6]] == [(s, i) for s in range(3) for i in (1, 2)]
+    best = min(steps[1:6:2], key=lambda step: step.loss).start
+    assert {step.start for step in steps[6:]} == {best}
+    assert steps[-1].iteration == 7
+    assert len(steps) <= config.total
+    again = list(fit_code(decoder, [view], PRIOR, config))
+    assert [step.loss for step in steps] == [step.loss for step in again], "the same seed gives the same steps"
+
+
+@pytest.mark.parametrize("iterations", [1, 2, 4])
+def test_a_fit_of_few_iterations_ends_with_the_best_start(decoder: Decoder, view: View, iterations: int) -> None:
+    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=iterations, starts=2, trial=9)))
+    assert steps[-1].iteration == iterations
+    assert sum(replace(CONFIG, iterations=iterations).stage_lengths) == iterations
+
+
+def test_the_solver_lowers_its_loss(decoder: Decoder, view: View) -> None:
+    problem = problem_of(decoder, view, CONFIG.compared)
+    steps = list(minimise(problem.residuals, problem.look(torch.zeros(4)), problem.moved, SolverConfig(8, scale=0.1)))
+    losses = [step.loss for step in steps]
+    assert losses == sorted(losses, reverse=True)
+    assert losses[-1] < 0.01 * problem.residuals(problem.look(torch.zeros(4))).loss(0.1)
+
+
+def test_no_view_and_nonsense_are_refused(decoder: Decoder) -> None:
+    with pytest.raises(ValueError, match="no view was given"):
+        next(fit_code(decoder, [], PRIOR))
+    for wrong in ({"iterations": 0}, {"starts": -1}, {"stages": 0}):
+        with pytest.raises(ValueError, match=f"{next(iter(wrong.values()))}.*at least 1"):
+            CodeFitConfig(**wrong)
