@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("errors", "files", "rays", "pose", "camera"),
+    *("errors", "files", "rays", "camera", "pose"),
     *("field", "primitives", "decoder", "checkpoint"),
     *(
         "trace",
@@ -27,8 +27,8 @@ ORDER = [
         "movie",
     ),
     *("differences", "moves", "retrace", "gradcheck", "dist_gradient"),
-    *("losses", "warp", "metrics", "mesh", "data", "targets"),
-    *("train", "resume", "fit", "fit_samples", "solver", "code_residuals", "fit_code"),
+    *("losses", "warp", "metrics", "mesh", "data", "targets", "sight"),
+    *("train", "resume", "fit", "fit_samples", "solver", "code_residuals", "fit_code", "alignment", "fit_camera"),
     *(
         "bench",
         "ablation",
@@ -40,6 +40,7 @@ ORDER = [
         "solvers",
         "page",
         "charts",
+        "pose_table",
         "scene",
         "tables",
         "report",

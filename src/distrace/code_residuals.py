@@ -26,11 +26,11 @@ PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
 
 @dataclass(frozen=True)
 class Comparison:
-    """What deviations count: squared up to `scale`, where they weigh as in Adam's loss; the prior weighs as there."""
+    """What deviations count: as in Adam's loss, rounded off below `scale`."""
 
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
-    scale: float = 0.1
+    scale: float = 0.02
     trace: TraceConfig = field(
         default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
     )

@@ -57,9 +57,7 @@ def near_surface(sdf: SDF, lattice: Lattice | None) -> SDF:
 
 
 @torch.no_grad()
-def prepared(
-    sdf: SDF, like: Tensor, radius: float = 1.0, config: FastConfig = FastConfig()
-) -> tuple[Lattice, int]:
+def prepared(sdf: SDF, like: Tensor, radius: float = 1.0, config: FastConfig = FastConfig()) -> tuple[Lattice, int]:
     """A lattice of the field; where that turns out to be too steep, one of the field divided by its steepness.
 
     And how many evaluations both took."""

@@ -82,8 +82,6 @@ class _Search:
         self.sdf, self.view, self.config = sdf, view, config
         self.shape = Still.of(sdf, view.camera.intrinsics)
         self.rays = rays_of(view, config.rays, config.seed)
-        if not self.rays.is_object.any():
-            raise ValueError("the view shows nothing of the object; it needs a depth, a mask or normals")
 
     def facing(self, start: Camera) -> Camera:
         seen = self.rays.pixels[self.rays.is_object]
@@ -107,7 +105,7 @@ class _Search:
     def refine(self, best: CameraStep) -> Iterator[CameraStep]:
         """With more rays, and those along the outline that pass between pixels."""
         view, count = self.view, self.config.rays
-        rays = rays_of(replace(view, mask=None), 2 * count, self.config.seed + 1)
+        rays = rays_of(view, 2 * count, self.config.seed + 1)
         if view.mask is not None:
             rays = rays + outline_of(view.mask, view.camera.pixels(), self.config.outline_rays)
         for found in minimise(

@@ -11,7 +11,7 @@ from distrace.code_residuals import Comparison, Problem, Seen
 from distrace.data.view import View
 from distrace.decoder import Decoder
 from distrace.fit import Prior, Step
-from distrace.solver import SolverConfig, minimise
+from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.targets import Pool
 
 DEVIATION = 0.7  # of the prior's, in draws of starts
@@ -21,13 +21,13 @@ DEVIATION = 0.7  # of the prior's, in draws of starts
 class CodeFitConfig:
     """Steps in stages, each with rays of its own and a smaller scale beyond which residuals count less."""
 
-    iterations: int = 15
-    stages: int = 3
+    iterations: int = 18
+    stages: int = 6
     depth_rays: int = 1000  # of each view in each stage
-    mask_rays: int = 500
+    mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
     compared: Comparison = Comparison()
-    narrowing: float = 0.6  # of the scale, from one stage to the next: at first what is far off is no outlier
-    damping: float = 1.0
+    narrowing: float = 0.7  # of the scale, from one stage to the next: at first what is far off is no outlier
+    damping: float = 0.1
     starts: int = 3
     trial: int = 3  # iterations that every start is given before the best goes on alone
     seed: int = 0
@@ -88,7 +88,7 @@ def _solved(decoder: Decoder, pools: list[Pool], prior: Prior, config: CodeFitCo
         compared = config.compared_at(stage)
         targets = [pool.draw(config.depth_rays, config.mask_rays, rays) for pool in pools]
         problem = Problem(decoder, prior, Seen.of(targets, compared.weights), compared)
-        solver = SolverConfig(length, damping, compared.scale, settled=0.0)
+        solver = SolverConfig(length, damping, compared.scale, kernel=charbonnier, settled=0.0)
         for solution in minimise(problem.residuals, problem.look(w), problem.moved, solver):
             w, damping, done = solution.state.w, solution.damping, done + 1
             terms = problem.terms(solution.state, solution.residuals)

@@ -24,7 +24,7 @@ from distrace.render import render
 
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST
 DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tenth of the distance
-OBSERVATIONS = ("depth", "silhouette", "normal", "depth+silhouette", "depth+silhouette+normal")
+OBSERVATIONS = ("depth+silhouette", "depth", "silhouette", "depth+silhouette+normal", "normal")
 FOCAL = "depth+silhouette, focal length off by 20 %"
 SIZE = 192  # pixels
 DEGREES, PERCENT = 0.5, 0.5  # within which a camera is found
@@ -61,11 +61,11 @@ class Found:
 
 
 def all_trials(cameras: int) -> list[Trial]:
-    """The whole protocol, camera by camera. What takes longer is tried on fewer: without depth on half of the cameras,
-    with normals on a fifth. The focal length is searched for from the mildest turn."""
-    pairs = [(seen, by) for by in DISTURBANCES for seen in OBSERVATIONS] + [(FOCAL, "10°")]
-    shares = {"silhouette": 2, "normal": 5, "depth+silhouette+normal": 5}
-    return [Trial(seen, by, k) for k in range(cameras) for seen, by in pairs if k * shares.get(seen, 1) < cameras]
+    """The whole protocol. What takes longer is tried on fewer: without depth on half of the cameras, with normals on a
+    fifth. The focal length is searched for from the mildest turn."""
+    counts = {"silhouette": -(-cameras // 2), "normal": -(-cameras // 5), "depth+silhouette+normal": -(-cameras // 5)}
+    protocol = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
+    return [Trial(seen, by, k) for seen, by in protocol for k in range(counts.get(seen, cameras))]
 
 
 def read_trials(path: Path) -> list[Found]:

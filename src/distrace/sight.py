@@ -31,11 +31,16 @@ class Sight:
 
 
 def rays_of(view: View, count: int, seed: int = 0) -> Sight:
-    """A third of the rays each on the object, beside its outline and around it; without a mask all on the object."""
+    """A third of the rays each on the object, beside its outline and around it; without a mask all on the object.
+
+    Raises `ValueError` where nothing was observed.
+    """
     random = torch.Generator().manual_seed(seed)
-    normals = torch.zeros(*view.depth.shape, 3) if view.normal is None else view.normal
+    normals = view.depth.new_zeros(*view.depth.shape, 3) if view.normal is None else view.normal
     known = view.seen | (normals.norm(dim=-1) > 0.5)
     inside = known if view.mask is None else known | view.mask
+    if not inside.any():
+        raise ValueError("the view shows nothing of the object; it needs a depth, a mask or normals")
     regions = [inside] if view.mask is None else [inside, band(view.mask), _around(view.mask)]
     chosen = torch.cat([_some(region, count // len(regions), random) for region in regions])
     is_object = inside.reshape(-1)[chosen]
@@ -45,12 +50,15 @@ def rays_of(view: View, count: int, seed: int = 0) -> Sight:
         is_object,
         torch.zeros_like(is_object) if view.mask is None else ~is_object,
         normals.reshape(-1, 3)[chosen] @ view.camera.T_world_camera[:3, :3],
-        _outside(inside).reshape(-1, 2)[chosen],
+        _outside(inside).to(view.depth).reshape(-1, 2)[chosen],
     )
 
 
 def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "height width 2"], count: int) -> Sight:
-    """Rays between pixels of the object and of the background beside them: there the outline is, to half a pixel."""
+    """Rays between pixels of the object and of the background beside them: there the outline is, to half a pixel.
+
+    At most `count`, drawn at random.
+    """
     middles = []
     for axis in (0, 1):
         length = mask.shape[axis] - 1
@@ -58,13 +66,11 @@ def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "heigh
         middles.append(((here + there) / 2)[first != second])
     pixels = torch.cat(middles)
     pixels = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:count]]
-    every, nothing = torch.ones_like(pixels[:, 0], dtype=torch.bool), torch.zeros(len(pixels), 3)
+    every, nothing = torch.ones_like(pixels[:, 0], dtype=torch.bool), pixels.new_zeros(len(pixels), 3)
     return Sight(pixels, torch.full_like(pixels[:, 0], torch.inf), every, every, nothing, nothing[:, :2])
 
 
 def _outside(inside: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 2"]:
-    if not inside.any():
-        return torch.zeros(*inside.shape, 2)
     y, x = torch.from_numpy(distance_transform_edt(~inside.numpy(), return_distances=False, return_indices=True))
     rows, columns = torch.meshgrid(*(torch.arange(size) for size in inside.shape), indexing="ij")
     return torch.stack([columns - x, rows - y], dim=-1).float()

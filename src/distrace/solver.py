@@ -13,24 +13,39 @@ from jaxtyping import Float
 from torch import Tensor
 
 State = TypeVar("State")
+Kernel = Callable[[Float[Tensor, "n"]], tuple[Float[Tensor, "n"], Float[Tensor, "n"]]]
+"""From squared residuals, in units of the scale, to their losses and to how much less they weigh than if squared."""
+
 LEAST_DAMPING, LARGEST_DAMPING = 1e-7, 1e7
 LEAST_CURVATURE = 1e-9  # of an unknown that nothing depends on, so that it stays where it is
 
 
+def cauchy(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Outliers hardly count."""
+    return squared.log1p(), 1 / (1 + squared)
+
+
+def charbonnier(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Far residuals count by their absolute values: as robust as a convex loss can be."""
+    root = (1 + squared).sqrt()
+    return 2 * (root - 1), 1 / root
+
+
 @dataclass(frozen=True)
 class SolverConfig:
-    """Residuals beyond `scale` count less and less (Cauchy); it starts wider, so that a far start is not an outlier."""
+    """Residuals beyond `scale` count less, as the kernel has it; it starts wider, so that a far start is no outlier."""
 
     iterations: int = 30
     damping: float = 1e-2  # at first, relative to each unknown's curvature
     scale: float = 1.0
     widest: float = 1.0  # × scale, at first …
     narrowing: float = 0.7  # … and from one iteration to the next
+    kernel: Kernel = cauchy
     settled: float = 1e-4  # a step that lowers the loss by less, relatively, is the last, and so is one as short
 
     def __post_init__(self) -> None:
         if self.iterations < 1 or not self.scale > 0 or not self.widest >= 1:
-            raise ValueError(f"{self} solves nothing; it takes an iteration, a positive scale and a widest of 1 or more")
+            raise ValueError(f"{self} solves nothing; it takes iterations, a positive scale and a widest of at least 1")
 
     def scale_at(self, iteration: int) -> float:
         return self.scale * max(1.0, self.widest * self.narrowing**iteration)
@@ -44,17 +59,20 @@ class Residuals:
     jacobian: Float[Tensor, "n unknowns"]
     weights: Float[Tensor, "n"]
 
-    def loss(self, scale: float) -> float:
-        """Σ w · c² log(1 + r²/c²) / 2, for residuals far below c that is Σ w r² / 2."""
-        return float((self.weights * scale**2 * (self.values / scale).square().log1p()).sum() / 2)
+    def loss(self, scale: float, kernel: Kernel = cauchy) -> float:
+        """Σ w · c² ρ(r²/c²) / 2, for residuals far below c that is Σ w r² / 2."""
+        losses, _ = kernel((self.values / scale).square())
+        return float((self.weights * scale**2 * losses).sum() / 2)
 
-    def step(self, scale: float, damping: float) -> Float[Tensor, "unknowns"]:
-        """The minimum of the damped quadratic, outliers down-weighted."""
-        weights = (self.weights / (1 + (self.values / scale).square()))[:, None]
+    def step(self, scale: float, damping: float, kernel: Kernel) -> tuple[Float[Tensor, "unknowns"], float]:
+        """The minimum of the damped quadratic, outliers down-weighted; and by how much it should lower the loss."""
+        _, shares = kernel((self.values / scale).square())
+        weights = (self.weights * shares)[:, None]
         jacobian, values = self.jacobian.double(), self.values.double()
-        curvature = jacobian.T @ (weights * jacobian)
+        curvature, slope = jacobian.T @ (weights * jacobian), jacobian.T @ (weights[:, 0] * values)
         damped = curvature.diagonal() * damping + LEAST_CURVATURE
-        return -torch.linalg.solve(curvature + damped.diag(), jacobian.T @ (weights[:, 0] * values)).to(self.values)
+        step = -torch.linalg.solve(curvature + damped.diag(), slope)
+        return step.to(self.values), float(step @ (damped * step - slope)) / 2
 
 
 @dataclass(frozen=True)
@@ -81,17 +99,19 @@ def minimise(
     now = residuals(state)
     for iteration in range(config.iterations):
         began, scale = time.perf_counter(), config.scale_at(iteration)
-        step = now.step(scale, damping)
+        step, expected = now.step(scale, damping, config.kernel)
         candidate = moved(state, step)
         then = residuals(candidate)
-        before, after = now.loss(scale), then.loss(scale)
+        before, after = now.loss(scale, config.kernel), then.loss(scale, config.kernel)
         accepted = after < before
         if accepted:
-            state, now, damping, growth = candidate, then, max(damping / 4, LEAST_DAMPING), 2.0
+            gain = (before - after) / max(expected, 1e-30)
+            damping, growth = max(damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING), 2.0
+            state, now = candidate, then
         else:
             damping, growth = min(damping * growth, LARGEST_DAMPING), 2 * growth
         seconds = time.perf_counter() - began
-        yield Solution(iteration + 1, state, now.loss(config.scale), damping, accepted, seconds, now)
+        yield Solution(iteration + 1, state, now.loss(config.scale, config.kernel), damping, accepted, seconds, now)
         little = step.norm() <= config.settled or abs(before - after) <= config.settled * before
         if little and scale == config.scale_at(config.iterations):
             return

@@ -90,9 +90,9 @@ def least(
 ) -> Float[Tensor, "*batch"]:
     """The value at a minimum along the ray, with its exact derivative.
 
-    Where f is smooth that is the field's own at the fixed point, for df/dt = 0 (the envelope theorem). Where a corner of
-    f lies on the ray, as every minimum of a ReLU network's is, it is the mean of both sides whose slope along the ray
-    vanishes; one look to each side serves both.
+    Where f is smooth that is the field's own at the fixed point, for df/dt = 0 (the envelope theorem). Where f has a
+    corner there, as a ReLU network has at every minimum, it is the mean of both sides whose slope along the ray
+    vanishes. One look to each side serves both.
     """
     with torch.no_grad():
         value = sdf(rays.at(lowest))
