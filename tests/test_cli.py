@@ -18,7 +18,7 @@ import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.data.samples import write_samples
-from distrace.data.view import View, save_view
+from distrace.data.view import View, load_view, save_view
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.train import TrainConfig, start, train
@@ -230,6 +230,25 @@ def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Co
     assert "15, after 3 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
+def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    run("pose", model, observation, "--code", 1, "--azimuth", 80, "--distance", 3.2, "--starts", 2, "--out", out)
+    assert names(out) == {"result.json", "posed.npz", "filmstrip.png"}
+    found = result(out, "T_world_camera", "intrinsics", "share_of_rays_off", "iterations", "evaluations")
+    assert np.linalg.norm(np.array(found["T_world_camera"])[:3, 3]) == pytest.approx(2.5, abs=0.1)
+    assert load_view(out / "posed.npz").camera.T_world_camera.tolist() == found["T_world_camera"]
+    assert found["percent_from_observation"] < 5
+    assert Image.open(out / "filmstrip.png").width > 100
+
+
+def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
+    model: Path, observation: Path, run: Command, tmp_path: Path
+) -> None:
+    words = ("--code", 1, "--focal", "--disturb", 5, "--starts", 1, "--ignore", "normal", "--out", tmp_path / "out")
+    run("pose", model, observation, *words)
+    assert result(tmp_path / "out")["intrinsics"][0][0] == pytest.approx(32, rel=0.05)
+
+
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
     run("bench", "trace", model, "--code", 1, "--size", 24, "--out", tmp_path)
     assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}
@@ -331,6 +350,14 @@ BAD = [
     ("complete {model} {view} --ignore depth", "--ignore"),
     ("complete {tmp}/missing {view}", "neither a folder nor a bundled model"),
     ("complete {model} {view} --iterations 1 --resolution 3", "resolution of 3"),
+    ("pose {model} {tmp}/missing.npz", "missing.npz is not an observation"),
+    ("pose {model} {tmp}/empty", "empty is not an observation"),
+    ("pose {model} {view} --code 7", "code 7 was asked for"),
+    ("pose {model} {view} --code {tmp}/text", "neither the number of a training shape nor a code.npy"),
+    ("pose {model} {view} --ignore depth mask", "shows nothing of the object"),
+    ("pose {model} {view} --starts 0", "0 starts"),
+    ("pose {model} {view} --azimuth 0 --distance 0", "its own place"),
+    ("evaluate pose --model {model} --cameras 0", "--cameras 0"),
     ("evaluate training --model {model} --meshes {tmp}/missing", "no shape in common"),
     ("evaluate completion --model {model} --meshes {tmp}/missing", "is missing; `distrace data furniture"),
     ("evaluate completion --model {model} --split {tmp}/text", "lacks the columns"),

@@ -85,7 +85,8 @@ class TestSight:
         centres = Camera.orbit(0, 0, 4, height=5, width=6).pixels()
         sight = outline_of(mask, centres, 100)
         assert len(sight.pixels) == 10  # around 2 × 3 pixels
-        assert ([2.0, 1.5] in sight.pixels.tolist()) and ([2.5, 1.0] in sight.pixels.tolist())
+        assert [2.0, 1.5] in sight.pixels.tolist()
+        assert [2.5, 1.0] in sight.pixels.tolist()
         assert (sight.is_object & sight.is_background).all()
         assert len(outline_of(mask, centres, 4).pixels) == 4
 

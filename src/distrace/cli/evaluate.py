@@ -22,6 +22,12 @@ from distrace.files import save_text
 from distrace.fit import FitConfig
 from distrace.page import figure, page, section, table
 
+SHORT = {
+    "rotation_median_degrees": "degrees",
+    "translation_median_percent": "shift %",
+    "focal_median_percent": "focal %",
+}
+
 
 @dataclass(frozen=True)
 class Evaluate:
@@ -48,6 +54,8 @@ class Evaluate:
 
     def _pose(self, run: Run) -> None:
         """What an earlier run has done is taken from its `trials.json`."""
+        if self.cameras < 1 or self.jobs < 1:
+            raise ValueError(f"--cameras {self.cameras} and --jobs {self.jobs} were given; both must be at least 1")
         opened(self.model, run.device)
         kept = pose_table.read_trials(run.out / "trials.json")
         known = {found.trial for found in kept}
@@ -58,7 +66,7 @@ class Evaluate:
                 save_json(run.out / "trials.json", [each.asdict() for each in kept])
                 bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")
         rows = pose_table.rows_of(self.model, kept)
-        show_table(rows)
+        show_table([{SHORT.get(key, key): value for key, value in row.items() if key != "model"} for row in rows])
         save_text(run.out / "index.html", pose_table.pose_page(self.model, rows))
         run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in kept)})
 

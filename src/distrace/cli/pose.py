@@ -20,6 +20,7 @@ from distrace.pose import pose_error, turned_object
 from distrace.render import render
 
 FRAMES = 8  # of the film strip
+STEPS = 30  # about so many from a good start
 
 
 @dataclass(frozen=True)
@@ -51,7 +52,7 @@ class Pose:
         field = model.field(_code(model, self.code))
         first = self._start(observed.camera)
         steps = []
-        with progress("fitting", 0) as bar:
+        with progress("fitting", STEPS) as bar:
             config = CameraConfig(starts=self.starts, focal=self.focal, seed=self.seed)
             for step in fit_camera(field, _without(observed, self.ignore), first, config):
                 steps.append(step)
