@@ -22,7 +22,7 @@ from distrace.targets import Pool
 
 ADAM = FitConfig(iterations=200, starts=1)
 SOLVER = CodeFitConfig(starts=1)
-POINTS = (100, 0)  # observed depths; 0: all of them
+POINTS = (100,)  # observed depths; 0: all of them
 RAYS = 1000  # with a depth, and as many of the silhouette, on which the loss of every curve is measured
 RESOLUTION = 128  # of the meshes that are compared
 APART = 20  # iterations of Adam between two measurements

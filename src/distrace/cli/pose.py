@@ -15,6 +15,7 @@ from distrace.cli.common import Flag, ModelName, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.data.view import View, read_view, save_view
 from distrace.errors import explained
+from distrace.field import SDF
 from distrace.fit_camera import CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error, turned_object
 from distrace.render import render
@@ -104,7 +105,7 @@ def _without(view: View, ignore: tuple[str, ...]) -> View:
     return replace(view, depth=depth, **{name: None for name in ignore if name != "depth"})
 
 
-def _filmstrip(field, observed: View, steps: list[CameraStep]) -> shading.Picture:
+def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.Picture:
     """The observed mask and the rendered one, from the start to the end; below, what is rendered."""
     mask = observed.seen if observed.mask is None else observed.mask
     picked = [steps[round(k * (len(steps) - 1) / (FRAMES - 1))] for k in range(min(FRAMES, len(steps)))]
