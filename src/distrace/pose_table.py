@@ -26,6 +26,7 @@ SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST
 DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tenth of the distance
 OBSERVATIONS = ("depth+silhouette", "depth", "silhouette", "depth+silhouette+normal", "normal")
 FOCAL = "depth+silhouette, focal length off by 20 %"
+PROTOCOL = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
 SIZE = 192  # pixels
 DEGREES, PERCENT = 0.5, 0.5  # within which a camera is found
 
@@ -64,8 +65,7 @@ def all_trials(cameras: int) -> list[Trial]:
     """The whole protocol. What takes longer is tried on fewer: without depth on half of the cameras, with normals on a
     fifth. The focal length is searched for from the mildest turn."""
     counts = {"silhouette": -(-cameras // 2), "normal": -(-cameras // 5), "depth+silhouette+normal": -(-cameras // 5)}
-    protocol = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
-    return [Trial(seen, by, k) for seen, by in protocol for k in range(counts.get(seen, cameras))]
+    return [Trial(seen, by, k) for seen, by in PROTOCOL for k in range(counts.get(seen, cameras))]
 
 
 def read_trials(path: Path) -> list[Found]:
@@ -149,8 +149,10 @@ def _restricted(view: View, observation: str) -> View:
 def rows_of(model: str, done: Sequence[Found]) -> list[dict[str, object]]:
     """One row for each observation and disturbance."""
     rows = []
-    for observation, disturbance in dict.fromkeys((each.trial.observation, each.trial.disturbance) for each in done):
+    for observation, disturbance in PROTOCOL:
         some = [each for each in done if (each.trial.observation, each.trial.disturbance) == (observation, disturbance)]
+        if not some:
+            continue
         rows.append(
             {
                 "model": model,
