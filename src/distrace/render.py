@@ -89,15 +89,13 @@ class Buffers:
     @_kept
     def clearance(self) -> Float[Tensor, "*batch"]:
         """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations."""
-        met = torch.isfinite(self.trace.closest)
+        met, hit = torch.isfinite(self.trace.closest), self.trace.hit
         least = torch.full_like(self.trace.closest, torch.inf)
-        hit = self.trace.hit[met]
-        rays, closest = self.rays[met], self.trace.closest[met]
-        if (~hit).any():
-            missing = rays[~hit].detach()
-            lowest = surface.minimum(self.sdf, missing, closest[~hit], meet_sphere(missing, self.radius))
-            closest = closest.masked_scatter(~hit, lowest)
-        return least.masked_scatter(met, surface.least(self.sdf, rays, closest))
+        least = least.masked_scatter(hit, self.near(self.rays[hit].at(self.trace.distance[hit])))
+        missed = met & ~hit
+        rays, closest = self.rays[missed], self.trace.closest[missed]
+        bounds = meet_sphere(rays.detach(), self.radius)
+        return least.masked_scatter(missed, surface.clearance(self.sdf, rays, closest, bounds))
 
 
 def render(

@@ -23,23 +23,17 @@ def attach(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> Float[Ten
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
     surface tangentially (|∇f · v| < 1e-6) there is no derivative, and none is given.
     """
-    distance = distance.detach()
-    if not (_moves(rays) or _differentiable(sdf, rays.detach().at(distance))):
-        return distance
-    change, slope = _change(sdf, rays, distance)
-    flat = slope.abs() < LEAST_SLOPE
-    return distance - torch.where(flat, 0.0, change / torch.where(flat, 1.0, slope))
-
-
-def _change(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> tuple[Tensor, Tensor]:
-    """A zero that changes as f does at fixed distances along the rays; and the slope ∇f · v there, a constant."""
-    fixed = rays.detach()
+    distance, fixed = distance.detach(), rays.detach()
     points = fixed.at(distance)
-    value, gradient = _linearised(sdf, points, _differentiable(sdf, points))
-    change = value - value.detach()
+    changes = _differentiable(sdf, points)
+    if not (changes or _moves(rays)):
+        return distance
+    value, gradient = _linearised(sdf, points, changes)
+    change, slope = value - value.detach(), (gradient * fixed.directions).sum(-1)
     if _moves(rays):
         change = change + (gradient * (rays.at(distance) - points)).sum(-1)
-    return change, (gradient * fixed.directions).sum(-1)
+    flat = slope.abs() < LEAST_SLOPE
+    return distance - torch.where(flat, 0.0, change / torch.where(flat, 1.0, slope))
 
 
 def _moves(rays: Rays) -> bool:
@@ -92,18 +86,21 @@ def least(
 
     Where f is smooth that is the field's own at the fixed point, for df/dt = 0 (the envelope theorem). Where f has a
     corner there, as a ReLU network has at every minimum, it is the mean of both sides whose slope along the ray
-    vanishes. One look to each side serves both.
+    vanishes: one look to each side serves both.
     """
     with torch.no_grad():
         value = sdf(rays.at(lowest))
     if not (_moves(rays) or _differentiable(sdf, rays.detach().at(lowest))):
         return value
     beside = reach / 5 ** (_rounds(lowest, refine) - 1)  # where the last round looked: the corner is between
-    sides = torch.stack([lowest - beside, lowest + beside])
+    steps = beside * torch.tensor([-1.0, 1.0]).to(lowest).reshape(2, *[1] * lowest.dim())
     both = Rays(rays.origins.expand(2, *rays.origins.shape), rays.directions.expand(2, *rays.directions.shape))
-    change, (falling, rising) = _change(sdf, both, sides)
-    corner = (falling < 0) & (rising > 0)
-    share = torch.where(corner, rising / torch.where(corner, rising - falling, 1.0), 0.5)
+    values = sdf(both.at(lowest + steps))
+    with torch.no_grad():
+        falling, rising = sdf(both.at(lowest + 2 * steps)) - values  # over the next step outwards
+    corner = (falling > 0) & (rising > 0)
+    share = torch.where(corner, rising / torch.where(corner, falling + rising, 1.0), 0.5)
+    change = values - values.detach()
     return value + share * change[0] + (1 - share) * change[1]
 
 
