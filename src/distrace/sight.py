@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from distrace.data.view import View
-from distrace.targets import band
+from distrace.targets import band, drawn
 
 
 @dataclass(frozen=True)
@@ -37,12 +37,12 @@ def rays_of(view: View, count: int, seed: int = 0) -> Sight:
     """
     random = torch.Generator().manual_seed(seed)
     normals = view.depth.new_zeros(*view.depth.shape, 3) if view.normal is None else view.normal
-    known = view.seen | (normals.norm(dim=-1) > 0.5)
-    inside = known if view.mask is None else known | view.mask
+    inside = view.observed
     if not inside.any():
         raise ValueError("the view shows nothing of the object; it needs a depth, a mask or normals")
     regions = [inside] if view.mask is None else [inside, band(view.mask), _around(view.mask)]
-    chosen = torch.cat([_some(region, count // len(regions), random) for region in regions])
+    pixels = [region.reshape(-1).nonzero()[:, 0] for region in regions]
+    chosen = torch.cat([drawn(some, count // len(regions), random) for some in pixels])
     is_object = inside.reshape(-1)[chosen]
     return Sight(
         view.camera.pixels().reshape(-1, 2)[chosen],
@@ -65,7 +65,7 @@ def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "heigh
         (first, second), (here, there) = ([image.narrow(axis, k, length) for k in (0, 1)] for image in (mask, centres))
         middles.append(((here + there) / 2)[first != second])
     pixels = torch.cat(middles)
-    pixels = pixels[torch.randperm(len(pixels), generator=torch.Generator().manual_seed(0))[:count]]
+    pixels = drawn(pixels, count, torch.Generator().manual_seed(0))
     every, nothing = torch.ones_like(pixels[:, 0], dtype=torch.bool), pixels.new_zeros(len(pixels), 3)
     return Sight(pixels, torch.full_like(pixels[:, 0], torch.inf), every, every, nothing, nothing[:, :2])
 
@@ -86,8 +86,3 @@ def _around(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
         spans.append(slice(max(int(there[0]) - half, 0), int(there[-1]) + 1 + half))
     box[spans[0], spans[1]] = True
     return box
-
-
-def _some(region: Bool[Tensor, "height width"], count: int, random: torch.Generator) -> Tensor:
-    pixels = region.reshape(-1).nonzero()[:, 0]
-    return pixels[torch.randperm(len(pixels), generator=random)[:count]]

@@ -48,7 +48,7 @@ class Pool:
     def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator) -> Targets:
         """At most so many rays with a depth, and as many of the silhouette: half along its outline, half anywhere."""
         sets = ((self.with_depth, depth_rays), (self.outline, mask_rays // 2), (self.anywhere, mask_rays // 2))
-        chosen = torch.cat([_draw(indices, count, random) for indices, count in sets])
+        chosen = torch.cat([drawn(indices, count, random) for indices, count in sets])
         view = self.view
         is_object = view.observed.reshape(-1)[chosen]
         normal = None if view.normal is None else view.normal.reshape(-1, 3)[chosen]
@@ -62,5 +62,6 @@ def band(mask: Bool[Tensor, "height width"], width: int = OUTLINE) -> Bool[Tenso
     return (max_pool2d(inner, width, 1, width // 2) != -max_pool2d(-inner, width, 1, width // 2))[0]
 
 
-def _draw(indices: Tensor, count: int, random: torch.Generator) -> Tensor:
+def drawn(indices: Tensor, count: int, random: torch.Generator) -> Tensor:
+    """At most `count` of them, at random."""
     return indices[torch.randperm(len(indices), generator=random)[:count]]

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import torch
 import trimesh
@@ -24,6 +24,19 @@ Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 def opened(name: str, device: torch.device) -> Model:
     return load_model(name).to(device)
+
+
+def orbiting(view: Any) -> Camera:
+    """The camera that a command's own words put around the shape."""
+    return Camera.orbit(
+        view.azimuth,
+        view.elevation,
+        view.distance,
+        focal_mm=view.focal_mm,
+        sensor_mm=view.sensor_mm,
+        height=view.size,
+        width=view.size,
+    )
 
 
 def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:

@@ -6,8 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from distrace.camera import Camera
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.common import ModelName, opened, orbiting, show_table
 from distrace.cli.console import console, origin, start
 from distrace.gradcheck import STRAY, GradientRow, check_gradients
 
@@ -29,7 +28,7 @@ class CheckGradients:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model, camera = opened(self.model, run.device), self._camera().to(run.device)
+        model, camera = opened(self.model, run.device), orbiting(self).to(run.device)
         found = check_gradients(model.field(self.code), camera, size=self.size)
         show_table([_line(row) for row in found.rows])
         wrong = [row for row in found.rows if not row.agrees]
@@ -40,17 +39,6 @@ class CheckGradients:
         run.finish({**facts, "rows": [{"model": self.model, **row.asdict()} for row in found.rows], **origin()})
         if wrong:
             sys.exit(1)
-
-    def _camera(self) -> Camera:
-        return Camera.orbit(
-            self.azimuth,
-            self.elevation,
-            self.distance,
-            focal_mm=self.focal_mm,
-            sensor_mm=self.sensor_mm,
-            height=self.size,
-            width=self.size,
-        )
 
 
 def _line(row: GradientRow) -> dict[str, object]:

@@ -10,7 +10,7 @@ import torch
 import tyro
 
 from distrace.camera import Camera
-from distrace.cli.common import Flag, ModelName, opened, save_buffers, save_mesh, save_pictures
+from distrace.cli.common import Flag, ModelName, opened, orbiting, save_buffers, save_mesh, save_pictures
 from distrace.cli.console import console, progress, start
 from distrace.field import Counted
 from distrace.mesh import MeshConfig, extract_mesh
@@ -62,7 +62,7 @@ class Render:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        camera = self._camera().to(run.device)
+        camera = orbiting(self).to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
         counted = Counted(opened(self.model, run.device).field(self.code))
         with torch.no_grad():
@@ -74,17 +74,6 @@ class Render:
         pixels = self.size * self.size * len(tallies)
         console.print(f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations")
         run.finish({**facts, "strategy": self.strategy, **({} if self.orbit is None else _each(tallies))})
-
-    def _camera(self) -> Camera:
-        return Camera.orbit(
-            self.azimuth,
-            self.elevation,
-            self.distance,
-            focal_mm=self.focal_mm,
-            sensor_mm=self.sensor_mm,
-            height=self.size,
-            width=self.size,
-        )
 
     def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
         """The same views; the first leaves its pictures and its arrays."""
