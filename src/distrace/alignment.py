@@ -12,8 +12,9 @@ from distrace.fast import near_surface, prepared
 from distrace.field import SDF, value_and_gradient
 from distrace.forecast import Kind, forecast
 from distrace.lattice import Lattice
+from distrace.passes import LATTICE_DOUBT
 from distrace.pose import object_in_camera
-from distrace.rays import Bounds, Rays, meet_box, meet_sphere
+from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.roots import Guess, settle
 from distrace.sight import Sight
 from distrace.solver import Residuals
@@ -23,7 +24,6 @@ from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
 APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
 CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
 REACH = 0.05  # for the least value on a ray: then to a fifth of that, and to a fifth of that
-LATTICE_DOUBT = 0.3
 CLOSE = 3e-4  # enough for a step of the solver
 MARCH = TraceConfig(coarse_levels=0, step_scale=1.2, tolerance=CLOSE, steps=30, least_step=1e-3)
 
@@ -53,9 +53,8 @@ class Still:
     @torch.no_grad()
     def trace(self, rays: Rays, bounds: Bounds) -> Trace:
         """Rays with a clear root are settled there, those that may meet the surface are marched, others pass by."""
-        box = self.lattice.box()
-        within = bounds if box is None else meet_box(rays, *box)
-        ahead = forecast(self.lattice, rays, within.near.maximum(bounds.near), within.far.minimum(bounds.far))
+        within = self.lattice.within(rays, bounds)
+        ahead = forecast(self.lattice, rays, within.near, within.far)
         guess = Guess(ahead.distance, ahead.slope, torch.full_like(ahead.slope, LATTICE_DOUBT))
         root = (ahead.kind == Kind.ROOT) & (ahead.begins > bounds.near)
         settled = settle(self.lattice.near, rays[root], guess[root], CLOSE, self.lattice.cell)

@@ -8,6 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.field import SDF, narrowed
+from distrace.rays import Bounds, Rays, meet_box
 
 INNER = 0.25  # of a cell's width: cells deeper inside than this are not halved, for rays meet the surface before them
 
@@ -52,6 +53,12 @@ class Lattice:
             return None
         low, high = (possible.amin(0) - 1).to(self.values), (possible.amax(0) + 1).to(self.values)
         return low * self.cell - 1, high * self.cell - 1
+
+    def within(self, rays: Rays, bounds: Bounds) -> Bounds:
+        """The stretch of each ray outside of which there is no surface."""
+        box = self.box()
+        inside = Bounds(bounds.far, bounds.near) if box is None else meet_box(rays, *box)
+        return Bounds(inside.near.maximum(bounds.near), inside.far.minimum(bounds.far))
 
     @torch.no_grad()
     def __call__(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:

@@ -3,10 +3,17 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float, Int, Num
+from jaxtyping import Bool, Float, Int, Num
 from torch import Tensor
 
 SIDES = [(y, x) for y in (-1, 0, 1) for x in (-1, 0, 1) if y or x]
+
+
+def thinned(mask: Bool[Tensor, "height width"], most: int) -> Bool[Tensor, "height width"]:
+    """At most so many of the pixels of a mask, evenly spread."""
+    pixels = mask.nonzero()
+    kept = pixels[:: -(-len(pixels) // most) or 1]
+    return torch.zeros_like(mask).index_put((kept[:, 0], kept[:, 1]), mask.new_ones(()))
 
 
 @dataclass(frozen=True)

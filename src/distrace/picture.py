@@ -9,7 +9,7 @@ from torch import Tensor
 from distrace.field import SDF
 from distrace.lattice import Lattice, LatticeConfig
 from distrace.neighbours import Grid
-from distrace.rays import Bounds, Rays, meet_box
+from distrace.rays import Bounds, Rays
 from distrace.roots import Guess, settle
 from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
 
@@ -56,9 +56,8 @@ class Picture:
         self.sdf = lattice.near if sdf == lattice.field else sdf
         self.lattice, self.config, self.grid = lattice, config, Grid(rays.shape)
         self.rays, self.near, self.far = rays.flat(), bounds.near.reshape(-1), bounds.far.reshape(-1)
-        box = lattice.box()
-        within = Bounds(self.far, self.near) if box is None else meet_box(self.rays, *box)
-        self.begin, self.end = within.near.maximum(self.near), within.far.minimum(self.far)
+        within = lattice.within(self.rays, Bounds(self.near, self.far))
+        self.begin, self.end = within.near, within.far
         self.meets, self.spacing = self.begin < self.end, spacing.reshape(-1)  # of pixels, at distance 1
         unknown, nowhere = torch.full_like(self.near, torch.nan), torch.full_like(self.near, torch.inf)
         self.distance, self.slope = nowhere.clone(), unknown.clone()

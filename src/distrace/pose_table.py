@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
@@ -25,6 +25,7 @@ from distrace.render import render
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST
 DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tenth of the distance
 OBSERVATIONS = ("depth+silhouette", "depth", "silhouette", "depth+silhouette+normal", "normal")
+PARTS = {"depth": "depth", "silhouette": "mask", "normal": "normal"}  # of a view, by what they are called
 FOCAL = "depth+silhouette, focal length off by 20 %"
 PROTOCOL = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
 SIZE = 192  # pixels
@@ -94,7 +95,8 @@ def found(model: str, trial: Trial) -> Found:
     field = shapes.field(trial.camera % len(shapes.codes))
     with torch.no_grad():
         buffers = render(field, camera)
-        view = _restricted(View(camera, buffers.depth, buffers.mask, buffers.normal), trial.observation)
+        view = View(camera, buffers.depth, buffers.mask, buffers.normal)
+    view = view.without(*(part for name, part in PARTS.items() if name not in trial.observation))
     start, focal = disturbed(camera, trial.disturbance, random), trial.observation == FOCAL
     if focal:
         start = zoomed(start, torch.tensor(1.2 if trial.camera % 2 else 0.8).log())
@@ -136,14 +138,6 @@ def _opened(model: str) -> Model:
     opened = load_model(model)
     opened.decoder.requires_grad_(False)
     return opened
-
-
-def _restricted(view: View, observation: str) -> View:
-    depth = view.depth if "depth" in observation else torch.full_like(view.depth, torch.inf)
-    mask, normal = (
-        image if name in observation else None for name, image in (("silhouette", view.mask), ("normal", view.normal))
-    )
-    return replace(view, depth=depth, mask=mask, normal=normal)
 
 
 def rows_of(model: str, done: Sequence[Found]) -> list[dict[str, object]]:

@@ -10,6 +10,7 @@ from distrace import surface
 from distrace.camera import Camera
 from distrace.differences import Images
 from distrace.field import SDF, value_and_gradient
+from distrace.neighbours import thinned
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers
 from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
@@ -57,7 +58,7 @@ class Retraced:
         if not trace.hit.any():
             raise ValueError("the camera sees nothing of this shape; there is no derivative to check")
         trace, slope = _exact(sdf, camera, trace, precision)
-        passing = _thinned((trace.outcome == Outcome.ESCAPED) & bounds.meets)
+        passing = thinned((trace.outcome == Outcome.ESCAPED) & bounds.meets, MOST)
         trace = replace(trace, closest=trace.closest.masked_fill(~(passing | trace.hit), torch.inf))
         missing, within = rays[passing], Bounds(bounds.near[passing], bounds.far[passing])
         rough = surface.minimum(sdf, missing, trace.closest[passing], within)
@@ -103,13 +104,6 @@ def zero_beside(
     for _ in range(CHORDS):
         last, distance = distance, distance - sdf(rays.at(distance)) / slope
     return distance.masked_fill(~((distance - last).abs() < precision), torch.nan)
-
-
-def _thinned(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """At most MOST of the pixels of a mask, evenly spread."""
-    pixels = mask.nonzero()
-    kept = pixels[:: -(-len(pixels) // MOST) or 1]
-    return torch.zeros_like(mask).index_put((kept[:, 0], kept[:, 1]), mask.new_ones(()))
 
 
 @torch.no_grad()

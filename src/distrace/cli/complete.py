@@ -1,7 +1,7 @@
 """`complete` and `demo`: a whole shape from one depth view."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -108,7 +108,7 @@ def _known(full: View, points: int | None, ignore: tuple[str, ...], seed: int) -
     if points is not None and points < 1:
         raise ValueError(f"--points {points} was given; at least one depth is needed")
     known = full if points is None else full.sparse(points, seed)
-    return replace(known, **{name: None for name in ignore})
+    return known.without(*ignore)
 
 
 def _reference(path: Path) -> Surface:

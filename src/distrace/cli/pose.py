@@ -55,7 +55,7 @@ class Pose:
         steps = []
         with progress("fitting", STEPS) as bar:
             config = CameraConfig(starts=self.starts, focal=self.focal, seed=self.seed)
-            for step in fit_camera(field, _without(observed, self.ignore), first, config):
+            for step in fit_camera(field, observed.without(*self.ignore), first, config):
                 steps.append(step)
                 bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}, {step.off:.1%} of the rays off")
         last = steps[-1]
@@ -98,11 +98,6 @@ def _code(model: Model, given: str) -> int | torch.Tensor:
         return int(given)
     with explained(f"--code {given} is neither the number of a training shape nor a code.npy"):
         return torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
-
-
-def _without(view: View, ignore: tuple[str, ...]) -> View:
-    depth = torch.full_like(view.depth, torch.inf) if "depth" in ignore else view.depth
-    return replace(view, depth=depth, **{name: None for name in ignore if name != "depth"})
 
 
 def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.Picture:

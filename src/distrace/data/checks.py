@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.neighbours import thinned
 
 WIDEST = 160.0  # degrees that a pinhole camera may see
 OBLONG = 4.0  # times that a pixel may be as long as wide
@@ -48,7 +49,7 @@ def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height wi
 
 def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> None:
     """Raises `ValueError` where most of what is seen turns its back to the camera."""
-    known = _spread(normal.any(-1))
+    known = thinned(normal.any(-1), MOST)
     directions = camera.rays(camera.pixels()[known]).directions
     facing = ((normal[known] * directions).sum(-1) < 0).float().mean()
     if facing < 0.5:
@@ -60,7 +61,7 @@ def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> No
 
 def check_place(camera: Camera, depth: Float[Tensor, "height width"], observed: Bool[Tensor, "height width"]) -> None:
     """Raises `ValueError` where what was observed is not in the unit sphere, or the camera does not see that."""
-    chosen = _spread(depth.isfinite() if depth.isfinite().any() else observed)
+    chosen = thinned(depth.isfinite() if depth.isfinite().any() else observed, MOST)
     pixels, depth = camera.pixels()[chosen], depth[chosen]
     away = _away(camera, pixels, depth)
     if away <= ALMOST:
@@ -109,11 +110,3 @@ def _others(camera: Camera) -> dict[str, Camera]:
         camera, intrinsics=centred
     )
     return others
-
-
-def _spread(chosen: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """At most MOST pixels of those, evenly spread."""
-    pixels = chosen.reshape(-1).nonzero()[:, 0]
-    some = torch.zeros_like(chosen).reshape(-1)
-    some[pixels[:: -(-len(pixels) // MOST) or 1]] = True
-    return some.reshape(chosen.shape)

@@ -55,6 +55,11 @@ class View:
         normal = None if self.normal is None else self.normal.masked_fill(~mask[..., None], 0.0)
         return replace(self, depth=depth, normal=normal)
 
+    def without(self, *parts: str) -> "View":
+        """The same view, not knowing `depth`, `mask` or `normal`."""
+        depth = torch.full_like(self.depth, torch.inf) if "depth" in parts else self.depth
+        return replace(self, depth=depth, **{part: None for part in parts if part != "depth"})
+
     def sparse(self, count: int, seed: int = 0) -> "View":
         """The same view with only `count` of its depths, drawn at random."""
         chosen = torch.randperm(int(self.seen.sum()), generator=torch.Generator().manual_seed(seed))[:count]
