@@ -12,11 +12,13 @@ from distrace import losses
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fit import LEAST_DEVIATION, FitConfig, Prior, Step, fit_shape, prior_of, view_terms
+from distrace.fit import FitConfig, fit_shape, view_terms
 from distrace.fit_samples import SampleFitConfig, around_points, fit_samples
 from distrace.primitives import sphere
+from distrace.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render
+from distrace.starts import Step
 from distrace.targets import OUTLINE, Pool, Targets
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)

@@ -152,7 +152,7 @@ def test_from_normals_alone_the_orientation_is_found() -> None:
 
 def test_where_one_start_leads_nowhere_another_does() -> None:
     observed = view(dtype=torch.float32)
-    start = turned(observed.camera, 100)
+    start = turned(observed.camera, 70)
     steps = list(fit_camera(shape, only(observed, "depth", "mask"), start))
     assert steps[-1].start > 0
     assert pose_error(steps[-1].camera, observed.camera)[0] < 0.5
@@ -163,7 +163,7 @@ def test_where_one_start_leads_nowhere_another_does() -> None:
 
 def test_a_camera_that_looks_away_is_turned_to_the_object() -> None:
     observed = view(dtype=torch.float32)
-    away = turned_object(observed.camera, torch.zeros(3), torch.tensor([6.0, 0, 0]))
+    away = turned_object(observed.camera, torch.zeros(3), torch.tensor([0, 6.0, 0]))
     assert pose_error(found(observed, away), observed.camera)[0] < 0.5
 
 
@@ -173,7 +173,7 @@ def test_a_focal_length_is_found_with_the_pose() -> None:
     camera = found(only(observed, "depth", "mask"), start, CameraConfig(focal=True))
     assert float(camera.intrinsics[0, 0] / observed.camera.intrinsics[0, 0]) == pytest.approx(1, abs=5e-3)
     assert pose_error(camera, observed.camera)[0] < 0.5
-    kept = found(only(observed, "depth", "mask"), start)
+    kept = found(only(observed, "depth", "mask"), start, CameraConfig(starts=1))
     torch.testing.assert_close(kept.intrinsics, start.intrinsics)
 
 
@@ -182,11 +182,11 @@ def test_outliers_among_the_depths_hardly_matter() -> None:
     depth, random = observed.depth.clone(), torch.Generator().manual_seed(0)
     wrong = observed.seen & (torch.rand(depth.shape, generator=random) < 0.15)
     depth[wrong] += 0.3 * torch.rand(int(wrong.sum()), generator=random) + 0.05
-    degrees, percent = pose_error(
-        found(replace(observed, depth=depth, normal=None), turned(observed.camera, 15)), observed.camera
-    )
+    steps = list(fit_camera(shape, replace(observed, depth=depth, normal=None), turned(observed.camera, 15)))
+    degrees, percent = pose_error(steps[-1].camera, observed.camera)
     assert degrees < 0.5
     assert percent < 0.5
+    assert max(step.start for step in steps) < 3, "two starts that end at the same camera are enough"
 
 
 def test_steps_tell_where_the_search_stands() -> None:

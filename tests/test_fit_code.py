@@ -11,11 +11,12 @@ from distrace.camera import Camera
 from distrace.code_residuals import Comparison, Problem, Seen, derivatives
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fit import Prior, Step
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.render import render
 from distrace.solver import SolverConfig, minimise
+from distrace.starts import Step
 from distrace.targets import Pool
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)

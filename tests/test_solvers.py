@@ -12,8 +12,8 @@ from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fit import Step
 from distrace.rays import meet_sphere
+from distrace.starts import Step
 from distrace.tables import solvers_page
 
 

@@ -11,7 +11,6 @@ from distrace.field import chunked as chunked
 from distrace.field import placed as placed
 from distrace.fit import FitConfig as FitConfig
 from distrace.fit import fit_shape as fit_shape
-from distrace.fit import prior_of as prior_of
 from distrace.fit_camera import CameraConfig as CameraConfig
 from distrace.fit_camera import fit_camera as fit_camera
 from distrace.gradcheck import GradientCheck as GradientCheck
@@ -22,6 +21,7 @@ from distrace.mesh import MeshConfig as MeshConfig
 from distrace.mesh import extract_mesh as extract_mesh
 from distrace.metrics import chamfer as chamfer
 from distrace.moves import decoder_changes as decoder_changes
+from distrace.prior import prior_of as prior_of
 from distrace.rays import Bounds as Bounds
 from distrace.rays import Rays as Rays
 from distrace.rays import meet_sphere as meet_sphere

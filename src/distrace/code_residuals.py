@@ -9,8 +9,8 @@ from torch import Tensor
 
 from distrace.decoder import CPU_CHUNK, Decoder
 from distrace.field import Counted
-from distrace.fit import Prior
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.solver import Residuals
 from distrace.surface import minimum

@@ -14,11 +14,13 @@ from distrace.checkpoint import Model
 from distrace.data.solid import Solid, load_solid, turned
 from distrace.data.split import Shape
 from distrace.data.view import View, observe
-from distrace.fit import FitConfig, Step, fit_shape, prior_of
+from distrace.fit import FitConfig, fit_shape
 from distrace.fit_samples import around_points, fit_samples
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
+from distrace.prior import prior_of
 from distrace.shading import Picture, grid
+from distrace.starts import Step
 
 METHODS = ("deepsdf", "ours", "ours+mask")
 OBSERVATION_SIZE = 256

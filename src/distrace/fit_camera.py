@@ -12,12 +12,14 @@ from distrace.alignment import Accuracy, Still, residuals
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.field import SDF, Counted
-from distrace.pose import aimed, turned_object, zoomed
+from distrace.pose import aimed, pose_error, turned_object, zoomed
 from distrace.rays import meet_sphere
 from distrace.sight import Sight, outline_of, rays_of
 from distrace.solver import Residuals, Solution, SolverConfig, minimise
 
-AGREES = 0.01  # a start is good once no larger share of its rays is off by more than the accuracy
+AGREES = 0.03  # a start is good once no larger share of its rays is off by more than the accuracy …
+MOSTLY = 0.2  # … or no larger one than that, where another start ends at the same camera …
+SAME = 1.0  # … to so many degrees, and percent of the distance
 AXES = ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))  # about which further starts are turned
 FRUITLESS = len(AXES)  # so many further starts that agree on no more rays are the last
 PATIENCE, PROGRESS = 5, 0.8  # a start whose loss falls by less in so many iterations is given up
@@ -66,15 +68,16 @@ def fit_camera(sdf: SDF, view: View, start: Camera, config: CameraConfig = Camer
     Raises `ValueError` where nothing was observed.
     """
     search = _Search(Counted(sdf), view, config)
-    best: CameraStep | None = None
+    ends: list[CameraStep] = []  # the best step of each start
     for k, first in enumerate(_starts(search.facing(start), config)):
+        steps = []
         for step in search.descend(first, k):
             yield step
-            best = step if best is None or step.off < best.off else best
-        if best is not None and (best.off < AGREES or k - best.start >= FRUITLESS):
+            steps.append(step)
+        ends.append(min(steps, key=_off))
+        if _settled(ends):
             break
-    assert best is not None
-    yield from search.refine(best)
+    yield from search.refine(min(ends, key=_off))
 
 
 class _Search:
@@ -119,6 +122,17 @@ class _Search:
     def step(self, start: int, found: Solution[Camera]) -> CameraStep:
         off = float(found.residuals.weights[found.residuals.values.abs() > 1].sum())
         return CameraStep(start, found.iteration, found.state, found.loss, off, found.seconds, self.sdf.evaluations)
+
+
+def _off(step: CameraStep) -> float:
+    return step.off
+
+
+def _settled(ends: list[CameraStep]) -> bool:
+    """Whether further starts are not worth their time: the best agrees, or is found again, or long not bettered."""
+    best = min(ends, key=_off)
+    again = [end for end in ends if max(pose_error(end.camera, best.camera)) < SAME]
+    return best.off < AGREES or (best.off < MOSTLY and len(again) > 1) or len(ends) - 1 - best.start >= FRUITLESS
 
 
 def _shifts(found: Residuals) -> Residuals:

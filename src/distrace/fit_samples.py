@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.decoder import Decoder
-from distrace.fit import Step
+from distrace.starts import Step
 from distrace.train import clamped_loss
 
 

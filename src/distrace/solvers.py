@@ -14,10 +14,12 @@ from distrace.checkpoint import Model
 from distrace.data.split import Shape
 from distrace.data.view import View, observe
 from distrace.evaluate import OBSERVATION_SIZE, solid_of
-from distrace.fit import FitConfig, Prior, Step, fit_shape, prior_of, view_terms
+from distrace.fit import FitConfig, fit_shape, view_terms
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
+from distrace.prior import Prior, prior_of
+from distrace.starts import Step
 from distrace.targets import Pool
 
 ADAM = FitConfig(iterations=200, starts=1)

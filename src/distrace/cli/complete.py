@@ -18,11 +18,13 @@ from distrace.cli.console import Run, console, progress, start
 from distrace.data.view import View, load_view
 from distrace.errors import explained
 from distrace.files import written
-from distrace.fit import FitConfig, Step, fit_shape, prior_of
+from distrace.fit import FitConfig, fit_shape
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import Chamfer, chamfer
+from distrace.prior import prior_of
 from distrace.render import render
+from distrace.starts import Step
 
 OBSERVATIONS = files("distrace") / "observations"
 DEMO_POINTS = 100
