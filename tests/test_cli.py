@@ -250,7 +250,7 @@ def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
 
 
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
-    run("bench", "trace", model, "--code", 1, "--size", 24, "--out", tmp_path)
+    run("bench", "trace", model, "--code", 1, "--size", 16, "--repeats", 1, "--out", tmp_path)
     assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}
     facts = result(tmp_path, "rows", "command", "machine", "evaluations")
     assert facts["command"].startswith("distrace bench trace")

@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from distrace.data.furniture import Mesh, catalogue, fetch, prepare, properties, summary, write_catalogue
+from distrace.data.debian import fetch
+from distrace.data.furniture import PACKAGE, Mesh, catalogue, prepare, summary, write_catalogue
+from distrace.data.properties import properties
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 ZERO = {
@@ -261,7 +263,7 @@ def test_fetch_asks_apt_get_once(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", fake_apt_get(tmp_path / "bin", script))
     (tmp_path / "out").mkdir()
     for _ in range(2):
-        assert fetch(tmp_path / "out") == tmp_path / "out/sweethome3d-furniture_1_all.deb"
+        assert fetch(PACKAGE, tmp_path / "out") == tmp_path / "out/sweethome3d-furniture_1_all.deb"
     assert (tmp_path / "calls").read_text() == "download sweethome3d-furniture\n"
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["sweethome3d-furniture_1_all.deb"]
 
@@ -273,11 +275,11 @@ def test_a_failing_apt_get_ends_in_advice_and_leaves_nothing(tmp_path, monkeypat
     monkeypatch.setenv("PATH", fake_apt_get(tmp_path / "bin", script))
     (tmp_path / "out").mkdir()
     with pytest.raises(ValueError, match=r"--from FILE\.deb \(E: Unable to locate\)$"):
-        fetch(tmp_path / "out")
+        fetch(PACKAGE, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []
 
 
 def test_a_system_without_apt_get_is_told_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(ValueError, match=r"download the \.deb by hand .*--from FILE\.deb"):
-        fetch(tmp_path)
+        fetch(PACKAGE, tmp_path)

@@ -55,6 +55,15 @@ def test_outliers_hardly_count_where_the_scale_is_small() -> None:
     assert float(squares[-1].state) > 5, "the mean is 11.6"
 
 
+@pytest.mark.parametrize(("even", "far"), [(True, False), (False, True)])
+def test_damped_evenly_what_hardly_anything_tells_of_hardly_moves(even: bool, far: bool) -> None:
+    """The second unknown would have to go to 1000 for what is a thousandth of the first one's residual."""
+    weak = torch.tensor([1.0, 1e-3], dtype=torch.float64)
+    steps = solved(lambda x: weak * x - 1, torch.zeros(2, dtype=torch.float64), SolverConfig(1, 0.1, even, scale=1e3))
+    assert float(steps[0].state[0]) == pytest.approx(1 / 1.05 if even else 1 / 1.1, rel=1e-3)
+    assert (steps[0].state[1] > 100) == far
+
+
 def test_the_loss_never_rises_and_damping_recovers_from_steps_too_far() -> None:
     start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
     steps = solved(rosenbrock, start, SolverConfig(100, damping=1e-7, scale=100.0, settled=0.0))

@@ -25,9 +25,6 @@ class Timing:
     ratio: float
     runs: int
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 def timings(model: Model, code: int, camera: Camera, repeats: int) -> list[Timing]:
     """A depth image by `fast` and its backward pass, for the code and for the camera, in turn after one to warm up."""

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from statistics import median
 
 import torch
@@ -40,9 +40,6 @@ class Row:
     depth_max: float
     outliers: int
     share: float = 1.0
-
-    def asdict(self) -> dict:
-        return asdict(self)
 
 
 @dataclass(frozen=True)

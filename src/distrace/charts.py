@@ -36,36 +36,25 @@ def curves(
 
 def growth(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: str) -> Html:
     """How values grow with x, both on logarithmic axes; each x is marked."""
-    chart, axes = _empty("both")
-    for i, (name, points) in enumerate(series.items()):
-        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=PALETTE[i % len(PALETTE)])
+    chart, axes = _lines(series)
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
     axes.set_xticks(sorted({x for points in series.values() for x in points}), minor=False)
     axes.minorticks_off()
     axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
-    axes.legend(frameon=False)
     return _drawn(chart)
 
 
 def courses(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: str) -> Html:
     """How values fall with x, both on logarithmic axes; the end of each is marked."""
-    chart, axes = _empty("both")
-    for i, (name, points) in enumerate(series.items()):
-        colour = PALETTE[i % len(PALETTE)]
-        axes.plot(list(points), list(points.values()), label=_plain(name), color=colour, linewidth=1.8)
-        axes.plot(list(points)[-1:], list(points.values())[-1:], "o", color=colour)
+    chart, axes = _lines(series, markevery=[-1])
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
-    axes.legend(frameon=False)
     return _drawn(chart)
 
 
 def steps_chart(series: Mapping[str, Mapping[str, float]], x_label: str, y_label: str) -> Html:
     """Values over named steps, from zero."""
-    chart, axes = _empty("y")
-    for i, (name, points) in enumerate(series.items()):
-        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=PALETTE[i % len(PALETTE)])
+    chart, axes = _lines(series)
     axes.set(xlabel=x_label, ylabel=y_label, ylim=(0, None))
-    axes.legend(frameon=False)
     return _drawn(chart)
 
 
@@ -78,6 +67,16 @@ def bars(values: Mapping[str, float], x_label: str) -> Html:
     axes.set(xlabel=x_label, xscale="log", xlim=(min(values.values()) / 2, max(values.values()) * 4))
     axes.invert_yaxis()
     return _drawn(chart)
+
+
+def _lines(series: Mapping[str, Mapping[Any, float]], **how: Any) -> tuple[Figure, Axes]:
+    """Each series by its x, all named in a legend."""
+    chart, axes = _empty("both")
+    for i, (name, points) in enumerate(series.items()):
+        colour = PALETTE[i % len(PALETTE)]
+        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=colour, **how)
+    axes.legend(frameon=False)
+    return chart, axes
 
 
 def _empty(grid: str, height: float = 3.6) -> tuple[Figure, Axes]:

@@ -20,6 +20,7 @@ from distrace.trace import TraceConfig, sphere_trace
 BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
 REACH, ROUNDS = 0.05, 2  # … to two thousandths
+GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
 PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
 
@@ -114,19 +115,20 @@ class Problem:
     def residuals(self, look: Look) -> Residuals:
         """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
 
-        Of a depth that is the field at the observed point or, where the surface hides that, (t − t_observed) · |∇f · v|
-        at the hit; of an object ray that misses the least value; of a ray of the background what that lacks to the
+        Of a depth that is the field at the observed point over |∇f · v| there or, where the surface hides that point,
+        t − t_observed; of an object ray that misses the least value; of a ray of the background what that lacks to the
         margin. All change with the code as f does at a fixed point.
         """
         seen, rows = self.seen, look.compared.nonzero()[:, 0]
         rays, t = seen.rays[rows], look.distance[rows]
         values, gradient, by_code = derivatives(self.decoder, rays.at(t), self.prior.code(look.w))
         self.evaluations += len(values)
-        slope = (gradient * rays.directions).sum(-1).abs()
-        before = torch.where(seen.known[rows], t - seen.observed[rows], 0.0)
+        slope, known = (gradient * rays.directions).sum(-1).abs(), seen.known[rows]
+        before = torch.where(known, t - seen.observed[rows], 0.0)
         lacking = torch.where(seen.is_object[rows], values.clamp_min(0), (values - self.config.margin).clamp_max(0))
-        values = torch.where(seen.known[rows], values + before * slope, lacking)
-        jacobian = (by_code @ self.prior.basis).masked_fill((values == 0)[:, None], 0.0)
+        along = torch.where(known, 1 / slope.clamp_min(GRAZING), 1.0)
+        values = torch.where(known, values + before * slope, lacking) * along
+        jacobian = (by_code @ self.prior.basis * along[:, None]).masked_fill((values == 0)[:, None], 0.0)
         count, own = len(look.w), SMALL * look.w
         own_weight = values.new_full((count,), 2 * self.config.weights.code / count / SMALL**2)
         return Residuals(

@@ -32,9 +32,6 @@ class FieldRow:
     exhausted: int  # of all pixels
     queries: int
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 @dataclass(frozen=True)
 class Hard:

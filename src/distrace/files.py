@@ -1,5 +1,6 @@
 """Files that are whole or absent, never half written."""
 
+import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -28,6 +29,11 @@ def written(path: Path) -> Iterator[BinaryIO]:
 def save_text(path: Path, text: str) -> None:
     with written(path) as file:
         file.write(text.encode())
+
+
+def save_json(path: Path, content: Any) -> None:
+    with written(path) as file:
+        file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
 
 
 def save_arrays(path: Path, arrays: dict[str, Tensor]) -> None:

@@ -21,13 +21,14 @@ from distrace.targets import Pool
 class CodeFitConfig(Starts):
     """Steps in stages, each with rays of its own and a smaller scale beyond which residuals count less."""
 
-    iterations: int = 18
+    iterations: int = 24
     trial: int = 3
-    stages: int = 6
+    stages: int = 8
     depth_rays: int = 1000  # of each view in each stage
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
+    first_share: float = 0.3  # of them, in the first stage; from the middle on all
     compared: Comparison = Comparison()
-    narrowing: float = 0.7  # of the scale, from one stage to the next: at first what is far off is no outlier
+    narrowing: float = 0.65  # of the scale, from one stage to the next: at first what is far off is no outlier
     damping: float = 0.1
 
     def __post_init__(self) -> None:
@@ -39,6 +40,10 @@ class CodeFitConfig(Starts):
     def stage_lengths(self) -> list[int]:
         ends = [self.iterations * stage // self.stages for stage in range(self.stages + 1)]
         return [end - begin for begin, end in pairwise(ends) if end > begin]
+
+    def share_at(self, stage: int) -> float:
+        """Of the rays of the silhouette: while all is coarse, a part of them is enough."""
+        return min(1.0, self.first_share + (1 - self.first_share) * stage / max(self.stages // 2, 1))
 
     def compared_at(self, stage: int) -> Comparison:
         return replace(self.compared, scale=self.compared.scale * self.narrowing**stage)
@@ -64,9 +69,10 @@ def _solved(decoder: Decoder, pools: list[Pool], prior: Prior, config: CodeFitCo
     rays, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
     for stage, length in enumerate(config.stage_lengths):
         compared = config.compared_at(stage)
-        targets = [pool.draw(config.depth_rays, config.mask_rays, rays) for pool in pools]
+        mask_rays = round(config.mask_rays * config.share_at(stage))
+        targets = [pool.draw(config.depth_rays, mask_rays, rays) for pool in pools]
         problem = Problem(decoder, prior, Seen.of(targets, compared.weights), compared)
-        solver = SolverConfig(length, damping, compared.scale, kernel=charbonnier, settled=0.0)
+        solver = SolverConfig(length, damping, even=True, scale=compared.scale, kernel=charbonnier, settled=0.0)
         for solution in minimise(problem.residuals, problem.look(w), problem.moved, solver):
             w, damping, done = solution.state.w, solution.damping, done + 1
             terms = problem.terms(solution.state, solution.residuals)

@@ -35,9 +35,6 @@ class GradientRow:
     left_out: int  # a kink, or no surface or minimum on both sides
     agrees: bool
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 @dataclass(frozen=True)
 class GradientCheck:

@@ -46,9 +46,6 @@ class RatioRow:
     pixels: int
     left_out: int  # a kink, or DIST's march ended without a hit
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 @dataclass(frozen=True)
 class Subject:

@@ -39,9 +39,6 @@ class GrowthRow:
     seconds: float
     runs: int
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 def by_size(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
     """Fast and coarse-to-fine on the poster's view; the latter up to 512 pixels, where it takes most of a minute."""

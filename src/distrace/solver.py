@@ -36,7 +36,8 @@ class SolverConfig:
     """Residuals beyond `scale` count less, as the kernel has it; it starts wider, so that a far start is no outlier."""
 
     iterations: int = 30
-    damping: float = 1e-2  # at first, relative to each unknown's curvature
+    damping: float = 1e-2  # at first, relative to each unknown's curvature …
+    even: bool = False  # … or to the mean one: where unknowns are alike, so that what nothing was seen of stays
     scale: float = 1.0
     widest: float = 1.0  # × scale, at first …
     narrowing: float = 0.7  # … and from one iteration to the next
@@ -64,13 +65,19 @@ class Residuals:
         losses, _ = kernel((self.values / scale).square())
         return float((self.weights * scale**2 * losses).sum() / 2)
 
-    def step(self, scale: float, damping: float, kernel: Kernel) -> tuple[Float[Tensor, "unknowns"], float]:
-        """The minimum of the damped quadratic, outliers down-weighted; and by how much it should lower the loss."""
+    def step(
+        self, scale: float, damping: float, kernel: Kernel, even: bool = False
+    ) -> tuple[Float[Tensor, "unknowns"], float]:
+        """The minimum of the damped quadratic, outliers down-weighted; and by how much it should lower the loss.
+
+        Each unknown is damped in proportion to its own curvature or, if `even`, to the mean one.
+        """
         _, shares = kernel((self.values / scale).square())
         weights = (self.weights * shares)[:, None]
         jacobian, values = self.jacobian.double(), self.values.double()
         curvature, slope = jacobian.T @ (weights * jacobian), jacobian.T @ (weights[:, 0] * values)
-        damped = curvature.diagonal() * damping + LEAST_CURVATURE
+        own = curvature.diagonal()
+        damped = (own.mean().expand(own.shape) if even else own) * damping + LEAST_CURVATURE
         step = -torch.linalg.solve(curvature + damped.diag(), slope)
         return step.to(self.values), float(step @ (damped * step - slope)) / 2
 
@@ -99,7 +106,7 @@ def minimise(
     now = residuals(state)
     for iteration in range(config.iterations):
         began, scale = time.perf_counter(), config.scale_at(iteration)
-        step, expected = now.step(scale, damping, config.kernel)
+        step, expected = now.step(scale, damping, config.kernel, config.even)
         candidate = moved(state, step)
         then = residuals(candidate)
         before, after = now.loss(scale, config.kernel), then.loss(scale, config.kernel)

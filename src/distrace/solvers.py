@@ -60,9 +60,6 @@ class SolverRow:
     evaluations: int
     chamfer: float
 
-    def asdict(self) -> dict:
-        return vars(self).copy()
-
 
 def solver_rows(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[tuple[SolverRow, Curve]]:
     """Each held-out shape completed from some and from all depths of one view and its mask, by both."""

@@ -1,6 +1,7 @@
 """Pages of the benchmarks: tables, charts, and maps of where queries and errors are."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
 
 import numpy as np
 
@@ -143,7 +144,7 @@ def _cells(
     rows: Sequence[Row] | Sequence[GrowthRow] | Sequence[RatioRow] | Sequence[Timing] | Sequence[SolverRow],
 ) -> tuple[list[str], list[list[str]]]:
     """Header and lines; counts with separators, small numbers in as few digits as tell."""
-    lines = [{key: value for key, value in line.asdict().items() if key != "share"} for line in rows]
+    lines = [{key: value for key, value in asdict(line).items() if key != "share"} for line in rows]
     return list(lines[0]), [[short(value) for value in line.values()] for line in lines]
 
 

@@ -1,6 +1,7 @@
 """`bench`: what tracing costs and how far it is off, as JSON, as a page and in the terminal."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -61,7 +62,7 @@ class Bench:
         maps = {row.strategy: tables.query_map(buffers) for row, buffers in measured if row.strategy in tables.MAPPED}
         save_png(run.out / "evaluations.png", side_by_side(list(maps.values())))
         save_text(run.out / "index.html", tables.trace_page(self.model, measured, truths))
-        _finish(run, [{"model": self.model, **row.asdict()} for row, _ in measured])
+        _finish(run, self._rows(row for row, _ in measured))
 
     def _fields(self, run: Run, model: Model) -> None:
         rows = []
@@ -70,7 +71,7 @@ class Bench:
                 rows.append(row)
                 bar.advance(f"{row.field}, {row.strategy}")
         save_text(run.out / "index.html", tables.fields_page(rows))
-        _finish(run, [{"model": self.model, **row.asdict()} for row in rows])
+        _finish(run, self._rows(rows))
 
     def _growth(self, run: Run, model: Model) -> None:
         field, rows = model.field(self.code), []
@@ -85,7 +86,7 @@ class Bench:
                     rows.append(row)
                     bar.advance(f"{row.axis} {row.value}, {row.strategy}: {row.seconds:.2f} s")
         save_text(run.out / "index.html", tables.growth_page(rows))
-        _finish(run, [{"model": self.model, **row.asdict()} for row in rows])
+        _finish(run, self._rows(rows))
 
     def _memory(self, run: Run, _: Model) -> None:
         rows = []
@@ -108,10 +109,10 @@ class Bench:
         rows, ratios = zip(*measured)
         timings = backward.timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
         save_text(run.out / "index.html", tables.gradients_page(rows, ratios, timings))
-        facts = [{"model": self.model, **row.asdict()} for row in rows]
-        times = [{"model": self.model, **timing.asdict()} for timing in timings]
-        show_table([{key: value for key, value in row.items() if key not in HIDDEN} for row in facts])
-        show_table([{key: value for key, value in time.items() if key != "model"} for time in times])
+        facts = self._rows(rows)
+        times = self._rows(timings)
+        _show(facts)
+        _show(times)
         evaluations = sum(subject.tally.evaluations for subject in subjects)
         run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
 
@@ -123,13 +124,20 @@ class Bench:
                 measured.append((row, curve))
                 bar.advance(f"{row.shape}, {row.points or 'all'} depths, {row.solver}: {row.loss:.4f}")
         save_text(run.out / "index.html", tables.solvers_page(measured))
-        rows = [{"model": self.model, **row.asdict()} for row, _ in measured]
-        show_table([{key: value for key, value in row.items() if key not in HIDDEN} for row in rows])
+        rows = self._rows(row for row, _ in measured)
+        _show(rows)
         courses = [{"seconds": curve.seconds, "losses": curve.losses} for _, curve in measured]
         evaluations = sum(row["evaluations"] for row in rows)
         run.finish({"rows": rows, "curves": courses, **origin(), "evaluations": evaluations})
 
+    def _rows(self, measured: Iterable[Any]) -> list[dict[str, Any]]:
+        return [{"model": self.model, **asdict(row)} for row in measured]
+
+
+def _show(rows: Sequence[dict[str, Any]]) -> None:
+    show_table([{SHORT.get(key, key): value for key, value in row.items() if key not in HIDDEN} for row in rows])
+
 
 def _finish(run: Run, rows: list[dict[str, Any]]) -> None:
-    show_table([{SHORT.get(key, key): value for key, value in row.items() if key not in HIDDEN} for row in rows])
+    _show(rows)
     run.finish({"rows": rows, **origin(), "evaluations": sum(row["queries"] for row in rows)})

@@ -1,6 +1,5 @@
 """What all commands share: progress, devices, and the result that each leaves behind."""
 
-import json
 import sys
 import time
 from collections.abc import Iterator
@@ -23,7 +22,7 @@ from rich.progress import (
 )
 
 from distrace.errors import explained
-from distrace.files import written
+from distrace.files import save_json
 
 console = Console()
 errors = Console(stderr=True, soft_wrap=True)
@@ -69,11 +68,6 @@ def chosen_device(name: str) -> torch.device:
 
 def device_name(device: torch.device) -> str:
     return torch.cuda.get_device_name(device) if device.type == "cuda" else f"cpu ({torch.get_num_threads()} threads)"
-
-
-def save_json(path: Path, content: Any) -> None:
-    with written(path) as file:
-        file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
 
 
 @contextmanager

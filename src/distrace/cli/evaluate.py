@@ -8,7 +8,7 @@ import tyro
 
 from distrace import pose_table, shading
 from distrace.cli.common import ModelName, opened, show_table
-from distrace.cli.console import Run, console, origin, progress, save_json, start
+from distrace.cli.console import Run, console, origin, progress, start
 from distrace.data.split import read_split
 from distrace.evaluate import (
     METHODS,
@@ -18,7 +18,7 @@ from distrace.evaluate import (
     summary,
     training_results,
 )
-from distrace.files import save_text
+from distrace.files import save_json, save_text
 from distrace.fit import FitConfig
 from distrace.page import figure, page, section, table
 
@@ -57,13 +57,14 @@ class Evaluate:
         if self.cameras < 1 or self.jobs < 1:
             raise ValueError(f"--cameras {self.cameras} and --jobs {self.jobs} were given; both must be at least 1")
         opened(self.model, run.device)
-        kept = pose_table.read_trials(run.out / "trials.json")
+        trials = run.out / "trials.json"
+        kept = pose_table.read_trials(trials, self.model)
         known = {found.trial for found in kept}
         wanted = [trial for trial in pose_table.all_trials(self.cameras) if trial not in known]
         with progress("cameras", len(wanted)) as bar:
             for found in pose_table.found_each(self.model, wanted, self.jobs):
                 kept.append(found)
-                save_json(run.out / "trials.json", [each.asdict() for each in kept])
+                pose_table.write_trials(trials, self.model, kept)
                 bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")
         rows = pose_table.rows_of(self.model, kept)
         show_table([{SHORT.get(key, key): value for key, value in row.items() if key != "model"} for row in rows])

@@ -1,7 +1,7 @@
 """`check-gradients`: every derivative of an image of a model against finite differences."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import tyro
@@ -36,7 +36,7 @@ class CheckGradients:
         count = f"{len(found.rows) - len(wrong)} of {len(found.rows)}"
         console.print(f"{count} agree, to {tolerance:g} at all but {STRAY:.0%} of what is compared")
         facts = {"agrees": found.agrees, "tolerance": tolerance, "stray": STRAY, "evaluations": found.evaluations}
-        run.finish({**facts, "rows": [{"model": self.model, **row.asdict()} for row in found.rows], **origin()})
+        run.finish({**facts, "rows": [{"model": self.model, **asdict(row)} for row in found.rows], **origin()})
         if wrong:
             sys.exit(1)
 

@@ -2,16 +2,15 @@
 
 import csv
 import re
-import shutil
-import subprocess
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ..errors import explained
-from .archive import unpack_deb, unpack_zip
+from .archive import unpack_zip
+from .debian import by_hand, fetch, unpacked
+from .properties import properties
 
 PACKAGE = "sweethome3d-furniture"
 COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
@@ -32,8 +31,6 @@ CATEGORIES = {
 ACCESSORIES = {"lamp", "fan", "bat", "model"}
 
 _PROPERTIES = "PluginFurnitureCatalog.properties"
-_STAMP = "unpacked-from.txt"
-_BY_HAND = f"download the .deb by hand from https://packages.debian.org/{PACKAGE} and pass --from FILE.deb"
 _LICENCE = re.compile(
     r"creativecommons\.org/(?:licenses/(?P<terms>[a-z-]+)/(?P<version>[\d.]+)(?:/(?P<country>[a-z]{2})\b)?"
     r"|(?:choose|publicdomain)/zero)"
@@ -69,30 +66,9 @@ def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
     """
     with explained(f"{out} cannot be written to; choose another --out"):
         out.mkdir(parents=True, exist_ok=True)
-    meshes = catalogue(deb or fetch(out), out)
+    meshes = catalogue(deb or fetch(PACKAGE, out), out)
     write_catalogue(meshes, out / "shapes.csv")
     return meshes
-
-
-def fetch(folder: Path) -> Path:
-    """The package's .deb in `folder`, by `apt-get download` unless it is there already; else a ValueError."""
-    present = sorted(folder.glob(f"{PACKAGE}_*.deb"))
-    if present:
-        return present[-1]
-    sentence = f"apt-get cannot download {PACKAGE}; {_BY_HAND}"
-    # apt-get writes under the final name from the first byte: an interrupted file must not look whole.
-    with explained(sentence), TemporaryDirectory(dir=folder) as partial:
-        downloaded = _download(Path(partial))
-        return downloaded.replace(folder / downloaded.name)
-
-
-def _download(folder: Path) -> Path:
-    command = ["apt-get", "download", PACKAGE]
-    done = subprocess.run(command, check=False, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    found = list(folder.glob(f"{PACKAGE}_*.deb"))
-    if done.returncode or not found:
-        raise ValueError(done.stderr.strip().rpartition("\n")[2])
-    return found[0]
 
 
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:
@@ -100,9 +76,9 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    shelves = _shelves(_unpacked(deb, folder))
+    shelves = _shelves(unpacked(PACKAGE, deb, folder, _arrange))
     if not shelves:
-        raise ValueError(f"{deb} holds no furniture catalogue (.sh3f); {_BY_HAND}")
+        raise ValueError(f"{deb} holds no furniture catalogue (.sh3f); {by_hand(PACKAGE)}")
     return [_mesh(shelf, model, folder) for shelf in shelves for model in shelf.models if _has_mesh(shelf, model)]
 
 
@@ -127,32 +103,9 @@ def _counted(words: Iterator[str]) -> str:
     return ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
 
 
-def _unpacked(deb: Path, folder: Path) -> Path:
-    """The folder of unpacked catalogues; its stamp is written last and names the .deb it came from."""
-    if not deb.is_file():
-        raise ValueError(f"there is no file {deb}; {_BY_HAND}")
-    home, source = folder / PACKAGE, f"{deb.name} {deb.stat().st_size}\n"
-    stamp = home / _STAMP
-    if stamp.is_file() and stamp.read_text() == source:
-        return home
-    if home.exists() and not stamp.is_file():
-        raise ValueError(f"{home} exists and is not an unpacked catalogue; move it or choose another --out")
-    partial = folder / f".{PACKAGE}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
-    _unpack(deb, partial)
-    (partial / _STAMP).write_text(source)
-    shutil.rmtree(home, ignore_errors=True)
-    return partial.replace(home)
-
-
-def _unpack(deb: Path, folder: Path) -> None:
-    package = folder / "package"
-    unpack_deb(deb, package)
-    for archive in package.rglob("*.sh3f"):
-        unpack_zip(archive, folder / archive.stem)
-    for licences in package.glob("usr/share/doc/*/copyright"):
-        licences.replace(folder / "copyright")
-    shutil.rmtree(package)
+def _arrange(content: Path, home: Path) -> None:
+    for archive in content.rglob("*.sh3f"):
+        unpack_zip(archive, home / archive.stem)
 
 
 def _shelves(home: Path) -> list[_Shelf]:
@@ -224,37 +177,3 @@ def _category(name: str, tags: str) -> str:
     if found := next((CATEGORIES[word] for word in words if word in CATEGORIES), None):
         return found
     return "car" if "car" in re.split(r"\s*,\s*", tags.lower()) else "other"
-
-
-def properties(content: bytes) -> dict[str, str]:
-    """The entries of a Java properties file, as java.util.Properties.load reads them."""
-    pairs = (re.match(r"((?:\\.|[^\\=:\s])*)\s*[=:]?\s*(.*)", line, re.DOTALL) for line in _lines(content))
-    return {_unescaped(pair[1]): _unescaped(pair[2]) for pair in pairs if pair}
-
-
-def _lines(content: bytes) -> Iterator[str]:
-    """Logical lines: comments and blanks dropped, those that end in a backslash joined to the next."""
-    logical = ""
-    for line in content.splitlines():
-        text = line.decode("latin-1").lstrip(" \t\f")
-        if not logical and text[:1] in ("", "#", "!"):
-            continue
-        logical += text
-        if (len(logical) - len(logical.rstrip("\\"))) % 2:
-            logical = logical[:-1]
-        else:
-            yield logical
-            logical = ""
-    if logical:
-        yield logical
-
-
-def _unescaped(text: str) -> str:
-    controls = {"t": "\t", "n": "\n", "r": "\r", "f": "\f"}
-    units = re.sub(
-        r"\\(u[0-9a-fA-F]{4}|.)",
-        lambda found: chr(int(found[1][1:], 16)) if len(found[1]) > 1 else controls.get(found[1], found[1]),
-        text,
-    )
-    # Java writes characters beyond 16 bits as two \u escapes: a surrogate pair, which Python would keep apart.
-    return units.encode("utf-16", "surrogatepass").decode("utf-16", "replace")

@@ -1,0 +1,40 @@
+"""Several starts: which of them goes on, and how many steps that takes."""
+
+from collections.abc import Iterator
+
+import pytest
+import torch
+
+from distrace.starts import Starts, Step, best_of
+
+
+def run(losses: list[list[float]], starts: Starts, recent: int = 8) -> list[tuple[int, int, float]]:
+    """Starts, iterations and losses of the steps, where each start's losses are known before."""
+
+    def going(start: int) -> Iterator[Step]:
+        for iteration, loss in enumerate(losses[start], 1):
+            yield Step(start, iteration, loss, {}, torch.zeros(2), seconds=1.0, evaluations=10)
+
+    return [(step.start, step.iteration, step.seconds) for step in best_of(starts, going, recent)]
+
+
+def test_all_are_tried_and_the_best_goes_on() -> None:
+    steps = run([[9, 8, 7, 6], [9, 5, 4, 3], [9, 6, 5, 4]], Starts(iterations=4, starts=3, trial=2))
+    assert [step[:2] for step in steps] == [(0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2), (1, 3), (1, 4)]
+    assert len(steps) == Starts(iterations=4, starts=3, trial=2).total
+
+
+@pytest.mark.parametrize(("recent", "best"), [(1, 0), (2, 1)])
+def test_a_trial_is_judged_by_its_last_losses(recent: int, best: int) -> None:
+    steps = run([[1, 9, 2, 0], [9, 3, 3, 0]], Starts(iterations=4, starts=2, trial=3), recent)
+    assert steps[-1][:2] == (best, 4)
+
+
+def test_a_start_that_has_settled_gives_its_last_step_again_which_costs_nothing() -> None:
+    assert run([[2, 1], [9, 8]], Starts(iterations=9, starts=2, trial=2))[-1] == (0, 2, 0.0)
+
+
+def test_a_single_start_is_not_tried() -> None:
+    assert run([[3, 2, 1]], Starts(iterations=3, starts=1)) == [(0, 1, 1.0), (0, 2, 1.0), (0, 3, 1.0)]
+    assert Starts(iterations=3, starts=1).total == 3
+    assert Starts(iterations=1, starts=4).total == 1
