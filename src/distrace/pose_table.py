@@ -65,8 +65,11 @@ class Found:
 
 
 def all_trials(cameras: int) -> list[Trial]:
-    """The whole protocol, of one camera after the other. The focal length is searched for from the mildest turn."""
-    return [Trial(seen, by, k) for k in range(cameras) for seen, by in PROTOCOL]
+    """The whole protocol: first what is seen with depth and silhouette, then the rest, of one camera after the other.
+
+    The focal length is searched for from the mildest turn."""
+    trials = [Trial(seen, by, k) for k in range(cameras) for seen, by in PROTOCOL]
+    return sorted(trials, key=lambda trial: not trial.observation.startswith("depth+silhouette"))
 
 
 def write_trials(path: Path, model: str, done: Sequence[Found]) -> None:
