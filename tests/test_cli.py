@@ -227,7 +227,7 @@ def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Co
     assert fitted(surface).abs().mean() < 0.03
     facts = result(tmp_path, "evaluations", "loss", "terms")
     assert set(facts["terms"]) == {"depth", "missing", "extra", "code"}
-    assert "18, after 3 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "24, after 3 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
@@ -244,9 +244,11 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:
-    words = ("--code", 1, "--focal", "--disturb", 5, "--starts", 1, "--ignore", "normal", "--out", tmp_path / "out")
-    run("pose", model, observation, *words)
-    assert result(tmp_path / "out")["intrinsics"][0][0] == pytest.approx(32, rel=0.05)
+    words = ("--code", 1, "--disturb", 5, "--disturb-focal", 1.1, "--starts", 1, "--ignore", "normal", "--out")
+    run("pose", model, observation, "--focal", *words, tmp_path / "found")
+    assert result(tmp_path / "found")["focal_percent_from_observation"] < 5
+    run("pose", model, observation, *words, tmp_path / "kept")
+    assert result(tmp_path / "kept")["focal_percent_from_observation"] == pytest.approx(10, abs=1e-3)
 
 
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:

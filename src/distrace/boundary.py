@@ -27,7 +27,6 @@ UNEXPLAINED = 0.5  # pixels before the tangent plane of what a neighbour sees: a
 ASIDE = 0.1  # pixels along the ray, to both sides of the least value, where the field is looked at
 ROUNDS = 2  # of Newton's, to where an outline crosses
 BEYOND = 0.1  # pixels by which a ray that grazes the surface may be taken to miss it
-STEEP = 0.5  # of f along the ray, over |∇f|: above, the ray does not pass the surface but enters it
 
 
 def shade(
@@ -124,9 +123,8 @@ def _crossed(buffers: Buffers, pairs: _Pairs) -> _Pairs:
         pairs = pairs.at(pairs.where, found)
         value, gradient, _ = _least(buffers.sdf, ray, found, ASIDE * pixel)
         slope = (gradient * pairs.apart(rays)[0]).sum(-1)
-        steep = (gradient * ray.directions).sum(-1).abs() > STEEP * gradient.norm(dim=-1)
         where = pairs.where - value / slope
-        some = ~steep & (slope > 0) & (where < 1 + BEYOND)
+        some = (slope > 0) & (where < 1 + BEYOND)
         pairs, pixel = pairs.at(where.clamp(0, 1), found)[some], pixel[some]
         reach = pixel
     return pairs

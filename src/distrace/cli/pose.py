@@ -17,7 +17,7 @@ from distrace.data.view import View, read_view, save_view
 from distrace.errors import explained
 from distrace.field import SDF
 from distrace.fit_camera import CameraConfig, CameraStep, fit_camera
-from distrace.pose import pose_error, turned_object
+from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render
 
 FRAMES = 8  # of the film strip
@@ -42,6 +42,7 @@ class Pose:
     elevation: float = 20.0  # degrees
     distance: float = 4.97  # of the camera from the origin
     disturb: float | None = None  # degrees by which the start is turned, to try how well it is found again
+    disturb_focal: float = 1.0  # by which the start's focal length is multiplied, to try the same of --focal
     starts: int = CameraConfig.starts
     seed: int = 0
     device: str = "cpu"
@@ -68,6 +69,11 @@ class Pose:
         if self.azimuth is not None:
             around = Camera.orbit(self.azimuth, self.elevation, self.distance, focal_px=float(camera.intrinsics[0, 0]))
             camera = replace(camera, T_world_camera=around.T_world_camera)
+        if not self.disturb_focal > 0:
+            raise ValueError(
+                f"--disturb-focal {self.disturb_focal} was given; a focal length is multiplied by more than 0"
+            )
+        camera = zoomed(camera, torch.tensor(self.disturb_focal).log())
         if self.disturb is None:
             return camera
         axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed))
@@ -86,9 +92,12 @@ class Pose:
             "setup_evaluations": 0,
         }
         degrees, percent = pose_error(last.camera, observed.camera)
+        focal = 100 * abs(float(last.camera.intrinsics[0, 0] / observed.camera.intrinsics[0, 0]) - 1)
         facts |= {"degrees_from_observation": degrees, "percent_from_observation": percent}
+        facts |= {"focal_percent_from_observation": focal}
         console.print(
-            f"{last.off:.1%} of the rays are off; {degrees:.3f}° and {percent:.3f} % from the observation's own pose"
+            f"{last.off:.1%} of the rays are off; from the observation's own camera it is {degrees:.3f}°, {percent:.3f} %"
+            f" of the distance and {focal:.3f} % of the focal length"
         )
         run.finish(facts)
 
