@@ -96,8 +96,8 @@ class Pose:
         facts |= {"degrees_from_observation": degrees, "percent_from_observation": percent}
         facts |= {"focal_percent_from_observation": focal}
         console.print(
-            f"{last.off:.1%} of the rays are off; from the observation's own camera it is {degrees:.3f}°, {percent:.3f} %"
-            f" of the distance and {focal:.3f} % of the focal length"
+            f"{last.off:.1%} of the rays are off; from the observation's own camera it is {degrees:.3f}°,"
+            f" {percent:.3f} % of the distance and {focal:.3f} % of the focal length"
         )
         run.finish(facts)
 
