@@ -9,7 +9,8 @@ import tyro
 
 from distrace.cli.common import Flag
 from distrace.cli.console import console, origin, progress, start
-from distrace.data import furniture, sampling
+from distrace.data import furniture, planes, sampling
+from distrace.data.catalogue import summary
 from distrace.data.samples import Doubt
 from distrace.data.split import every_mesh, read_split
 
@@ -18,14 +19,17 @@ from distrace.data.split import every_mesh, read_split
 class Data:
     """Fetch a source of meshes, unpack it, and list every mesh with its creator and licence."""
 
-    name: tyro.conf.Positional[Literal["furniture"]]  # furniture: Debian's sweethome3d-furniture
-    out: Path = Path("out/furniture")
+    name: tyro.conf.Positional[Literal["furniture", "planes"]]
+    """furniture: Debian's sweethome3d-furniture; planes: the aircraft of its flightgear-data-ai"""
+    out: Path | None = None  # by default out/furniture or out/planes
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None  # the .deb, where apt-get is not at hand
 
     def run(self) -> None:
-        run = start(self.out)
-        meshes = furniture.prepare(self.out, self.source)
-        console.print(furniture.summary(meshes, self.out), markup=False)
+        run = start(self.out or Path("out") / self.name)
+        meshes = (furniture if self.name == "furniture" else planes).prepare(run.out, self.source)
+        console.print(summary(meshes), markup=False)
+        if self.name == "furniture":
+            console.print(f"{furniture.left_out(run.out)} models in other formats are left out")
         run.finish({"source": self.name, "meshes": len(meshes)})
 
 

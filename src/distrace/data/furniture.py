@@ -1,19 +1,16 @@
 """A catalogue of furniture meshes: Debian's package `sweethome3d-furniture`, with creators and licences."""
 
-import csv
 import re
-from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import explained
 from .archive import unpack_zip
+from .catalogue import Mesh, write_catalogue
 from .debian import by_hand, fetch, unpacked
 from .properties import properties
 
 PACKAGE = "sweethome3d-furniture"
-COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
 CATEGORIES = {
     "chair": "chair",
     "armchair": "chair",
@@ -37,16 +34,6 @@ _LICENCE = re.compile(
 )
 _AUTHORS = (re.compile(r'downloading ".*" by (.+)'), re.compile(r"<title>.* by (.+?) - \d+ - "))
 _HEADER_AUTHOR = re.compile(r"^# 3D models created by ([^,\r\n]+)", re.MULTILINE)
-
-
-@dataclass(frozen=True)
-class Mesh:
-    category: str
-    name: str
-    creator: str
-    licence: str  # SPDX
-    package: str
-    path: Path  # of the .obj, relative to the catalogue's folder
 
 
 @dataclass(frozen=True)
@@ -82,25 +69,10 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
     return [_mesh(shelf, model, folder) for shelf in shelves for model in shelf.models if _has_mesh(shelf, model)]
 
 
-def write_catalogue(meshes: list[Mesh], path: Path) -> None:
-    """The meshes as a table in UTF-8 CSV, one row each; ValueError if `path` cannot be written."""
-    rows = ((m.category, m.name, m.creator, m.licence, m.package, m.path.as_posix()) for m in meshes)
-    sentence = f"{path} cannot be written; choose another --out"
-    with explained(sentence), path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows((COLUMNS, *rows))
-
-
-def summary(meshes: list[Mesh], folder: Path) -> str:
-    """Counts by category and licence, and of the models left out because they are not plain .obj files."""
+def left_out(folder: Path) -> int:
+    """How many models of the catalogues are no plain .obj files."""
     shelves = _shelves(folder / PACKAGE)
-    others = sum(not _has_mesh(shelf, model) for shelf in shelves for model in shelf.models)
-    categories = _counted(mesh.category for mesh in meshes)
-    licences = _counted(mesh.licence for mesh in meshes)
-    return f"{len(meshes)} meshes ({categories}; {licences}), {others} models in other formats left out"
-
-
-def _counted(words: Iterator[str]) -> str:
-    return ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
+    return sum(not _has_mesh(shelf, model) for shelf in shelves for model in shelf.models)
 
 
 def _arrange(content: Path, home: Path) -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Bool, Float
 
+from distrace.data.ac3d import load_ac3d
 from distrace.errors import explained
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
@@ -45,15 +46,23 @@ class Solid:
 def load_solid(path: Path) -> Solid:
     """The solid of a mesh file, centred and scaled into the unit sphere.
 
-    Raises `ValueError` for a file that trimesh cannot read, or that bounds nothing.
+    Raises `ValueError` for a file that cannot be read, or that bounds nothing.
     """
-    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF or GLB file"):
-        mesh: Any = trimesh.load(path, force="mesh", skip_materials=True, process=False)
-        soup = normalised(trimesh.Trimesh(mesh.vertices, mesh.faces, process=False))
+    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file"):
+        soup = normalised(load_soup(path))
     surface = outer_surface(soup)
     if surface.area < 0.05 * soup.area:
         raise ValueError(f"{path} bounds no solid: only {surface.area / soup.area:.0%} of its faces have an inside")
     return Solid(soup, surface)
+
+
+def load_soup(path: Path) -> trimesh.Trimesh:
+    """All triangles of a file, as they are."""
+    if path.suffix.lower() == ".ac":  # trimesh does not know AC3D
+        corners = load_ac3d(path)
+        return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
+    mesh: Any = trimesh.load(path, force="mesh", skip_materials=True, process=False)
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
 
 
 def turned(solid: Solid, degrees: float) -> Solid:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from distrace.errors import explained
 
-MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb")
+MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".ac")
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,39 @@
+"""A catalogue of meshes: what each is, who made it, and under which licence; as a table beside the unpacked files."""
+
+import csv
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import explained
+
+COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    category: str
+    name: str
+    creator: str
+    licence: str  # SPDX
+    package: str
+    path: Path  # relative to the catalogue's folder
+
+
+def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
+    """The meshes as a table in UTF-8 CSV, one row each; ValueError if `path` cannot be written."""
+    rows = ((m.category, m.name, m.creator, m.licence, m.package, m.path.as_posix()) for m in meshes)
+    sentence = f"{path} cannot be written; choose another --out"
+    with explained(sentence), path.open("w", newline="", encoding="utf-8") as file:
+        csv.writer(file, lineterminator="\n").writerows((COLUMNS, *rows))
+
+
+def summary(meshes: Sequence[Mesh]) -> str:
+    """Counts by category and licence."""
+    categories, licences = _counted(mesh.category for mesh in meshes), _counted(mesh.licence for mesh in meshes)
+    return f"{len(meshes)} meshes ({categories}; {licences})"
+
+
+def _counted(words: Iterable[str]) -> str:
+    return ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())
