@@ -80,13 +80,16 @@ VIEW = ("--distance", "2.5", "--focal-mm", "32", "--size", "32")
 def test_render_writes_arrays_and_pictures(model: Path, run: Command, tmp_path: Path) -> None:
     run("render", model, "--code", 1, "--out", tmp_path, *VIEW)
     pictures = {"depth.png", "normal.png", "mask.png", "shaded.png"}
-    assert names(tmp_path) == {"result.json", "buffers.npz", *pictures}
+    assert names(tmp_path) == {"result.json", "buffers.npz", "view.npz", *pictures}
+    observed = load_view(tmp_path / "view.npz")
     with np.load(tmp_path / "buffers.npz") as archive:
         arrays = {name: archive[name] for name in archive.files}
     assert set(arrays) == {"depth", "distance", "normal", "mask", "evaluations", "outcome"}
     assert all(array.shape[:2] == (32, 32) for array in arrays.values())
     assert all(Image.open(tmp_path / name).size == (32, 32) for name in pictures)
     camera = Camera.orbit(30, 20, 2.5, focal_mm=32, sensor_mm=32, height=32, width=32)
+    torch.testing.assert_close(observed.camera.T_world_camera, camera.T_world_camera)
+    assert (observed.depth.numpy() == arrays["depth"]).all()
     closed_form = camera.depth(meet_sphere(camera.rays(), RADII[1]).near).numpy()
     both = arrays["mask"] & np.isfinite(closed_form)
     assert both.sum() > 0.8 * np.isfinite(closed_form).sum()
@@ -177,7 +180,7 @@ def test_ctrl_c_in_an_orbit_leaves_the_first_view_and_no_half_movie(
     monkeypatch.setattr(distrace.movie, "render", interrupted)
     said = one_line(run, capsys, ("render", model, "--orbit", 3, "--out", tmp_path, *VIEW), status=130)
     assert "stopped" in said
-    assert names(tmp_path) == {"buffers.npz", "depth.png", "normal.png", "mask.png", "shaded.png"}
+    assert names(tmp_path) == {"buffers.npz", "view.npz", "depth.png", "normal.png", "mask.png", "shaded.png"}
 
 
 def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:

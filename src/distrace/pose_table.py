@@ -28,7 +28,6 @@ DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tent
 OBSERVATIONS = ("depth+silhouette", "depth", "silhouette", "depth+silhouette+normal", "normal")
 PARTS = {"depth": "depth", "silhouette": "mask", "normal": "normal"}  # of a view, by what they are called
 FOCAL = "depth+silhouette, focal length off by 20 %"
-FEW = 10  # cameras
 PROTOCOL = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
 SIZE = 192  # pixels
 FIRST_SEED = 1000  # no camera that the search was tuned on
@@ -66,11 +65,11 @@ class Found:
 
 
 def all_trials(cameras: int) -> list[Trial]:
-    """The whole protocol, of one camera after the other; after the first few what matters most goes before the rest.
+    """The whole protocol, of one camera after the other; depth with silhouette goes before the rest.
 
     The focal length is searched for from the mildest turn."""
     trials = [Trial(seen, by, k) for k in range(cameras) for seen, by in PROTOCOL]
-    return sorted(trials, key=lambda trial: trial.camera >= FEW and trial.observation not in (OBSERVATIONS[0], FOCAL))
+    return sorted(trials, key=lambda trial: trial.observation not in (OBSERVATIONS[0], FOCAL))
 
 
 def write_trials(path: Path, model: str, done: Sequence[Found]) -> None:

@@ -12,6 +12,8 @@ import tyro
 from distrace.camera import Camera
 from distrace.cli.common import Flag, ModelName, opened, orbiting, save_buffers, save_mesh, save_pictures
 from distrace.cli.console import console, progress, start
+from distrace.data.view import View as Observation
+from distrace.data.view import save_view
 from distrace.field import Counted
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
@@ -76,10 +78,11 @@ class Render:
         run.finish({**facts, "strategy": self.strategy, **({} if self.orbit is None else _each(tallies))})
 
     def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
-        """The same views; the first leaves its pictures and its arrays."""
+        """The same views; the first leaves its pictures and its arrays, also as an observation for other commands."""
         first = next(views)
         save_pictures(self.out, first, camera)
         save_buffers(self.out / "buffers.npz", first, self.clearance)
+        save_view(self.out / "view.npz", Observation(camera, first.depth, first.mask, first.normal))
         yield first
         yield from views
 
