@@ -70,12 +70,12 @@ def bars(values: Mapping[str, float], x_label: str) -> Html:
 
 
 def _lines(series: Mapping[str, Mapping[Any, float]], **how: Any) -> tuple[Figure, Axes]:
-    """Each series by its x, all named in a legend."""
+    """Each series by its x, all named below."""
     chart, axes = _empty("both")
     for i, (name, points) in enumerate(series.items()):
         colour = PALETTE[i % len(PALETTE)]
         axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=colour, **how)
-    axes.legend(frameon=False)
+    chart.legend(loc="outside lower left", ncols=3, frameon=False)
     return chart, axes
 
 
