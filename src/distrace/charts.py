@@ -75,7 +75,7 @@ def _lines(series: Mapping[str, Mapping[Any, float]], **how: Any) -> tuple[Figur
     for i, (name, points) in enumerate(series.items()):
         colour = PALETTE[i % len(PALETTE)]
         axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=colour, **how)
-    chart.legend(loc="outside lower left", ncols=3, frameon=False)
+    chart.legend(loc="outside lower left", ncols=2, frameon=False)
     return chart, axes
 
 
