@@ -28,7 +28,8 @@ ORDER = [
     ),
     *("differences", "moves", "retrace", "gradcheck", "dist_gradient"),
     *("losses", "warp", "metrics", "mesh", "data", "targets", "sight"),
-    *("train", "resume", "fit", "fit_samples", "solver", "code_residuals", "fit_code", "alignment", "fit_camera"),
+    *("train", "resume", "prior", "starts", "fit", "fit_samples"),
+    *("solver", "code_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
     *(
         "bench",
         "ablation",

@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.alignment import Accuracy, Still, residuals
+from distrace.blurred import Blurred
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.field import SDF, Counted
@@ -23,6 +24,9 @@ SAME = 1.0  # … to so many degrees, and percent of the distance
 AXES = ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))  # about which further starts are turned
 FRUITLESS = len(AXES)  # so many further starts that agree on no more rays are the last
 PATIENCE, PROGRESS = 5, 0.8  # a start whose loss falls by less in so many iterations is given up
+
+BLURS = (2.5, 1.2)  # pixels of a coarse grid
+APPROACH = SolverConfig(iterations=10, damping=0.3, scale=100.0, settled=1e-2)
 
 
 def _search() -> SolverConfig:
@@ -85,6 +89,8 @@ class _Search:
         self.sdf, self.view, self.config = sdf, view, config
         self.shape = Still.of(sdf, view.camera.intrinsics)
         self.rays = rays_of(view, config.rays, config.seed)
+        vague = view.normal is not None and not view.depth.isfinite().any()
+        self.blurred = [Blurred.of(self.shape, view, sigma) for sigma in BLURS] if vague else []
 
     def facing(self, start: Camera) -> Camera:
         seen = self.rays.pixels[self.rays.is_object]
@@ -92,6 +98,9 @@ class _Search:
 
     def descend(self, first: Camera, k: int) -> Iterator[CameraStep]:
         """Shifts, then turns, too; ends early where rays agree, or where it leads nowhere."""
+        for step in self.approach(first, k):
+            yield step
+            first = step.camera
         shift = replace(self.config.search, iterations=4, narrowing=1.0)
         for found in minimise(lambda camera: _shifts(self.off(camera)), first, _shifted, shift):
             first = found.state
@@ -104,6 +113,13 @@ class _Search:
             lost = len(losses) > PATIENCE + 3 and losses[-1] > PROGRESS * losses[-1 - PATIENCE]
             if step.off < AGREES / 2 or (lost and step.off > AGREES):
                 return
+
+    def approach(self, first: Camera, k: int) -> Iterator[CameraStep]:
+        """By blurred images, where there are normals and no depth."""
+        for images in self.blurred:
+            for found in minimise(images.residuals, first, _moved, APPROACH):
+                first = found.state
+                yield self.step(k, replace(found, residuals=self.off(first)))
 
     def refine(self, best: CameraStep) -> Iterator[CameraStep]:
         """With more rays, and those along the outline that pass between pixels."""
