@@ -39,8 +39,7 @@ def view(sdf: SDF = shape, size: int = 64, dtype: torch.dtype = f64) -> View:
 
 
 def only(observed: View, *kept: str) -> View:
-    depth = observed.depth if "depth" in kept else torch.full_like(observed.depth, torch.inf)
-    return replace(observed, depth=depth, **{name: None for name in ("mask", "normal") if name not in kept})
+    return observed.without(*{"depth", "mask", "normal"}.difference(kept))
 
 
 def turned(camera: Camera, degrees: float, shift: tuple[float, float, float] = (0.05, -0.04, 0.1)) -> Camera:

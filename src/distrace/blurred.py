@@ -18,7 +18,6 @@ from distrace.solver import Residuals
 
 SIZE = 32  # pixels along the longer side
 STEP = 0.02  # of differences: radians, and radii of the unit sphere
-NORMAL = 0.5  # length above which a normal is known
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class Blurred:
         if view.normal is None:
             raise ValueError("the view has no normals to compare")
         factor = min(1.0, SIZE / max(view.depth.shape))
-        coarse, known = view.camera.resized(factor), view.normal.norm(dim=-1, keepdim=True) > NORMAL
+        coarse, known = view.camera.resized(factor), view.normal.any(-1, keepdim=True)
         images = torch.cat([view.normal @ view.camera.T_world_camera[:3, :3], known.to(view.normal)], dim=-1)
         pooled = F.adaptive_avg_pool2d(images.permute(2, 0, 1), (coarse.height, coarse.width))
         return Blurred(shape, factor, pooled[3:], blurred(pooled[:3], sigma), sigma)

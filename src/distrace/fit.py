@@ -37,16 +37,15 @@ def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: Fit
 
     Raises `ValueError` without views, or with one from inside the mean shape.
     """
-    if not views:
-        raise ValueError("no view was given; fitting needs at least one")
-    check_outside(decoder.field(prior.mean), views, prior.mean.device)
-    pools = [Pool.of(view) for view in views]
+    pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
     return best_of(config, lambda start: _descend(decoder, pools, prior, config, start))
 
 
 @torch.no_grad()
-def check_outside(mean: SDF, views: Sequence[View], device: torch.device) -> None:
-    """From inside a shape nothing is hit, and nothing can be learnt."""
+def pools_of(mean: SDF, views: Sequence[View], device: torch.device) -> list[Pool]:
+    """What can be drawn from each view. From inside the mean shape nothing is hit, and nothing can be learnt."""
+    if not views:
+        raise ValueError("no view was given; fitting needs at least one")
     eyes = torch.stack([view.camera.T_world_camera[:3, 3] for view in views])
     values = mean(eyes.to(device))
     if (values < 0).any():
@@ -54,6 +53,7 @@ def check_outside(mean: SDF, views: Sequence[View], device: torch.device) -> Non
         raise ValueError(
             f"the camera at {eye} is inside the mean shape; shapes are seen from outside, about the origin"
         )
+    return [Pool.of(view) for view in views]
 
 
 def _descend(decoder: Decoder, pools: list[Pool], prior: Prior, config: FitConfig, start: int) -> Iterator[Step]:

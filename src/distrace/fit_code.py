@@ -10,7 +10,7 @@ import torch
 from distrace.code_residuals import Comparison, Problem, Seen
 from distrace.data.view import View
 from distrace.decoder import Decoder
-from distrace.fit import check_outside
+from distrace.fit import pools_of
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.starts import Starts, Step, best_of
@@ -56,10 +56,7 @@ def fit_code(
 
     Raises `ValueError` without views, or with one from inside the mean shape.
     """
-    if not views:
-        raise ValueError("no view was given; fitting needs at least one")
-    check_outside(decoder.field(prior.mean), views, prior.mean.device)
-    pools = [Pool.of(view) for view in views]
+    pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
     return best_of(config, lambda start: _solved(decoder, pools, prior, config, start), recent=1)
 
 

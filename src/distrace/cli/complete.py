@@ -69,7 +69,7 @@ class Complete:
     points: int | None = None  # use only so many of the depths, drawn at random
     ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
     solver: Literal["adam", "lm"] = "adam"  # lm: Levenberg–Marquardt, in a fraction of the time
-    iterations: int | None = None  # by default 150 of Adam, or 18 of Levenberg–Marquardt
+    iterations: int | None = None  # by default 150 of Adam, or 24 of Levenberg–Marquardt
     starts: int = FitConfig.starts
     seed: int = 0
     resolution: int = 128  # of the mesh

@@ -2,11 +2,12 @@
 
 import csv
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from ..errors import explained
+from .debian import fetch
 
 COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
 
@@ -19,6 +20,20 @@ class Mesh:
     licence: str  # SPDX
     package: str
     path: Path  # relative to the catalogue's folder
+
+
+def listed(
+    package: str, catalogue: Callable[[Path, Path], list[Mesh]], out: Path, deb: Path | None = None
+) -> list[Mesh]:
+    """The meshes of a Debian package, unpacked under `out` and listed in out/shapes.csv; fetched if `deb` is None.
+
+    Raises ValueError if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
+    """
+    with explained(f"{out} cannot be written to; choose another --out"):
+        out.mkdir(parents=True, exist_ok=True)
+    meshes = catalogue(deb or fetch(package, out), out)
+    write_catalogue(meshes, out / "shapes.csv")
+    return meshes
 
 
 def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:

@@ -4,10 +4,9 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import explained
 from .archive import unpack_zip
-from .catalogue import Mesh, write_catalogue
-from .debian import by_hand, fetch, unpacked
+from .catalogue import Mesh, listed
+from .debian import by_hand, unpacked
 from .properties import properties
 
 PACKAGE = "sweethome3d-furniture"
@@ -47,15 +46,8 @@ class _Shelf:
 
 
 def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """Every mesh of the package, unpacked under `out` and listed in out/shapes.csv; fetched if `deb` is None.
-
-    Raises ValueError if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
-    """
-    with explained(f"{out} cannot be written to; choose another --out"):
-        out.mkdir(parents=True, exist_ok=True)
-    meshes = catalogue(deb or fetch(PACKAGE, out), out)
-    write_catalogue(meshes, out / "shapes.csv")
-    return meshes
+    """Every mesh of the package, by `catalogue.listed`."""
+    return listed(PACKAGE, catalogue, out, deb)
 
 
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:

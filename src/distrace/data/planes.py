@@ -3,9 +3,8 @@
 import shutil
 from pathlib import Path
 
-from ..errors import explained
-from .catalogue import Mesh, write_catalogue
-from .debian import by_hand, fetch, unpacked
+from .catalogue import Mesh, listed
+from .debian import by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -15,16 +14,8 @@ NO_PLANES = {"Ferry", "SpaceShuttle", "balloon"}
 
 
 def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """One mesh of each aircraft of the package, unpacked under `out` and listed in out/shapes.csv; fetched if `deb` is
-    None.
-
-    Raises ValueError if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
-    """
-    with explained(f"{out} cannot be written to; choose another --out"):
-        out.mkdir(parents=True, exist_ok=True)
-    meshes = catalogue(deb or fetch(PACKAGE, out), out)
-    write_catalogue(meshes, out / "shapes.csv")
-    return meshes
+    """One mesh of each aircraft of the package, by `catalogue.listed`."""
+    return listed(PACKAGE, catalogue, out, deb)
 
 
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:
