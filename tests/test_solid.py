@@ -9,7 +9,7 @@ import torch
 import trimesh
 
 from distrace import primitives
-from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, stretched, turned
+from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, turned
 
 SHIFT = np.array([0.5, 0.3, 0.2])  # of the second of two unit cubes
 MIDDLE = SHIFT / 2
@@ -130,15 +130,6 @@ def test_a_quarter_turn_is_the_solid_of_the_turned_mesh(overlapping: Solid, tmp_
     x, y, z = mesh.vertices.T
     mesh.vertices = np.stack([z, y, -x], axis=1)
     assert_same_solid(turned(overlapping, 90.0), load_solid(stored(tmp_path, mesh)))
-
-
-@pytest.mark.parametrize("factors", [(1.3, 0.8, 1.1), (-1.2, 0.9, 1.0)])
-def test_a_stretched_or_mirrored_solid_is_the_solid_of_the_stretched_mesh(
-    overlapping: Solid, tmp_path: Path, factors: tuple[float, float, float]
-) -> None:
-    mesh = cubes()
-    mesh.vertices = mesh.vertices * factors  # where mirrored, all its faces are inside out
-    assert_same_solid(stretched(overlapping, np.array(factors)), load_solid(stored(tmp_path, mesh)))
 
 
 def test_a_sheet_bounds_no_solid(tmp_path: Path) -> None:

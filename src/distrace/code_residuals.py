@@ -88,6 +88,10 @@ class Problem:
     config: Comparison
     evaluations: int = 0
 
+    @property
+    def scale(self) -> float:
+        return self.config.scale
+
     @torch.no_grad()
     def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
         """Rays are followed from where they ended last; those with a depth no farther than that.
@@ -129,13 +133,8 @@ class Problem:
         along = torch.where(known, 1 / slope.clamp_min(GRAZING), 1.0)
         values = torch.where(known, values + before * slope, lacking) * along
         jacobian = (by_code @ self.prior.basis * along[:, None]).masked_fill((values == 0)[:, None], 0.0)
-        count, own = len(look.w), SMALL * look.w
-        own_weight = values.new_full((count,), 2 * self.config.weights.code / count / SMALL**2)
-        return Residuals(
-            torch.cat([values, own]),
-            torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
-            torch.cat([seen.weights[rows] / self.config.scale, own_weight]),
-        )
+        weights = seen.weights[rows] / self.config.scale
+        return with_prior(values, jacobian, weights, look.w, self.config.weights.code)
 
     def terms(self, look: Look, residuals: Residuals) -> dict[str, float]:
         """The parts of Adam's loss, its depths measured from the surface: what of all scales can be compared."""
@@ -145,6 +144,22 @@ class Problem:
         kinds = {"depth": known, "missing": ~known & is_object, "extra": ~known & ~is_object}
         code = self.config.weights.code * look.w.square().mean()
         return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
+
+
+def with_prior(
+    values: Float[Tensor, "n"],
+    jacobian: Float[Tensor, "n dimensions"],
+    weights: Float[Tensor, "n"],
+    w: Float[Tensor, "dimensions"],
+    weight: float,
+) -> Residuals:
+    """With residuals for the prior, whose loss is weight × the mean squared coordinate."""
+    count = len(w)
+    return Residuals(
+        torch.cat([values, SMALL * w]),
+        torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
+        torch.cat([weights, values.new_full((count,), 2 * weight / count / SMALL**2)]),
+    )
 
 
 def derivatives(

@@ -1,7 +1,7 @@
 """Results tables: how well a model knows its shapes, and how well shapes are completed from one sparse view."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
 
@@ -11,19 +11,24 @@ import trimesh
 
 from distrace.bench import poster_view
 from distrace.checkpoint import Model
-from distrace.data.solid import Solid, load_solid, turned
+from distrace.code_residuals import Comparison
+from distrace.data.samples import sample
+from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape
 from distrace.data.view import View, observe
-from distrace.fit import FitConfig, fit_shape
-from distrace.fit_samples import around_points, fit_samples
+from distrace.fit import FitConfig
+from distrace.fit_code import CodeFitConfig, fit_points
+from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
+from distrace.methods import METHODS, steps_of
 from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 from distrace.starts import Step
 
-METHODS = ("deepsdf", "ours", "ours+mask")
 OBSERVATION_SIZE = 256
+TOLD = 20_000  # distances that a held-out shape is told by
+TOLD_FIT = CodeFitConfig(iterations=40, compared=Comparison(Weights(code=1e-4)))
 
 
 @dataclass(frozen=True)
@@ -53,14 +58,6 @@ class Result:
         }
 
 
-def solid_of(shape: Shape, meshes: Path) -> Solid:
-    """A shape of a split as it was learnt. Raises `ValueError` where its mesh is missing."""
-    path = meshes / shape.path
-    if not path.is_file():
-        raise ValueError(f"{path} is missing; `distrace data furniture --out {meshes}` fetches it")
-    return turned(load_solid(path), shape.turn)
-
-
 def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
     """Each training shape as its code gives it, against the outer surface of its mesh."""
     for shape in shapes:
@@ -68,6 +65,22 @@ def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution
             truth = solid_of(shape, meshes).surface
             code = model.codes[model.shapes.index(shape.name)]
             yield compared(shape.name, "training code", 0, model, code, truth, 0.0, resolution)
+
+
+def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
+    """Each held-out shape as the code says it best: fitted to distances all around it."""
+    for shape in shapes:
+        if shape.split == "test":
+            solid = solid_of(shape, meshes)
+            yield best_told(model, shape.name, solid, resolution)
+
+
+def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
+    """A solid as the model says it best."""
+    samples = torch.from_numpy(sample(solid, TOLD, seed=0))
+    steps = list(fit_points(model.decoder, samples, prior_of(model.codes), TOLD_FIT))
+    seconds = sum(step.seconds for step in steps)
+    return compared(name, "all distances", 0, model, steps[-1].code, solid.surface, seconds, resolution)
 
 
 def completion_results(
@@ -85,12 +98,7 @@ def completion_results(
 
 def completed(model: Model, view: View, method: str, config: FitConfig) -> tuple[Step, float]:
     """The last step of a method's fit, and how long all of it took."""
-    if method == "deepsdf":
-        assert view.normal is not None, "DeepSDF is given the true normals"
-        steps = list(fit_samples(model.decoder, around_points(view.points(), view.normal[view.seen])))
-    else:
-        known = replace(view, normal=None, mask=view.mask if method == "ours+mask" else None)
-        steps = list(fit_shape(model.decoder, [known], prior_of(model.codes), config))
+    steps = list(steps_of(model, view, method, config))
     return steps[-1], sum(step.seconds for step in steps)
 
 

@@ -1,20 +1,23 @@
-"""Fitting a shape's code to observed views by Levenberg–Marquardt: a tenth of Adam's steps, hardly dearer ones."""
+"""Fitting a shape's code by Levenberg–Marquardt, to views or to points: a tenth of Adam's steps, hardly dearer ones."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace.code_residuals import Comparison, Problem, Seen
 from distrace.data.view import View
 from distrace.decoder import Decoder
 from distrace.fit import pools_of
+from distrace.point_residuals import PointProblem
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.starts import Starts, Step, best_of
-from distrace.targets import Pool
 
 
 @dataclass(frozen=True)
@@ -57,19 +60,45 @@ def fit_code(
     Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-    return best_of(config, lambda start: _solved(decoder, pools, prior, config, start), recent=1)
+
+    def problem(stage: int, random: torch.Generator) -> Problem:
+        compared, mask_rays = config.compared_at(stage), round(config.mask_rays * config.share_at(stage))
+        targets = [pool.draw(config.depth_rays, mask_rays, random) for pool in pools]
+        return Problem(decoder, prior, Seen.of(targets, compared.weights), compared)
+
+    return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
 
 
-def _solved(decoder: Decoder, pools: list[Pool], prior: Prior, config: CodeFitConfig, start: int) -> Iterator[Step]:
-    """From one start, on the same rays as from the others."""
-    began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
-    rays, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
-    for stage, length in enumerate(config.stage_lengths):
+def fit_points(
+    decoder: Decoder, samples: Float[Tensor, "n 4"], prior: Prior, config: CodeFitConfig = CodeFitConfig()
+) -> Iterator[Step]:
+    """Fits a code to points and their signed distances, which are 0 on the surface, as `fit_code` does to views.
+
+    Raises `ValueError` without points.
+    """
+    if not len(samples):
+        raise ValueError("no points were given; fitting needs points with their signed distances")
+
+    def problem(stage: int, random: torch.Generator) -> PointProblem:
+        chosen = samples[torch.randperm(len(samples), generator=random)[: config.depth_rays + config.mask_rays]]
         compared = config.compared_at(stage)
-        mask_rays = round(config.mask_rays * config.share_at(stage))
-        targets = [pool.draw(config.depth_rays, mask_rays, rays) for pool in pools]
-        problem = Problem(decoder, prior, Seen.of(targets, compared.weights), compared)
-        solver = SolverConfig(length, damping, even=True, scale=compared.scale, kernel=charbonnier, settled=0.0)
+        return PointProblem(decoder, prior, chosen, compared.weights.depth, compared.weights.code, compared.scale)
+
+    return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
+
+
+def _solved(
+    problem_of: Callable[[int, torch.Generator], Problem | PointProblem],
+    prior: Prior,
+    config: CodeFitConfig,
+    start: int,
+) -> Iterator[Step]:
+    """From one start, on the same rays or points as from the others."""
+    began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
+    random, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
+    for stage, length in enumerate(config.stage_lengths):
+        problem: Any = problem_of(stage, random)
+        solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=charbonnier, settled=0.0)
         for solution in minimise(problem.residuals, problem.look(w), problem.moved, solver):
             w, damping, done = solution.state.w, solution.damping, done + 1
             terms = problem.terms(solution.state, solution.residuals)

@@ -50,6 +50,11 @@ def fit_samples(
         yield Step(0, iteration + 1, float(loss.detach()), terms, code.detach().clone(), time.perf_counter() - began)
 
 
+def on_surface(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
+    """Surface points as samples."""
+    return torch.cat([points, torch.zeros_like(points[:, :1])], dim=1)
+
+
 def around_points(
     points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], offset: float = 0.01
 ) -> Float[Tensor, "m 4"]:

@@ -1,11 +1,9 @@
 """How often a disturbed camera is found again: the protocol, its rows, and its page."""
 
 import json
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import cache
-from multiprocessing import get_context
 from pathlib import Path
 from statistics import median
 
@@ -87,15 +85,6 @@ def read_trials(path: Path, model: str) -> list[Found]:
     if whose != model:
         raise ValueError(f"{path} holds trials of {whose}, not of {model}; give another --out")
     return done
-
-
-def found_each(model: str, wanted: Sequence[Trial], jobs: int) -> Iterator[Found]:
-    """Each trial, as it is done; in so many processes of one thread each."""
-    with ProcessPoolExecutor(
-        jobs, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
-    ) as pool:
-        for done in as_completed([pool.submit(found, model, trial) for trial in wanted]):
-            yield done.result()
 
 
 def found(model: str, trial: Trial) -> Found:

@@ -11,9 +11,10 @@ from torch import Tensor
 
 from distrace.bench import poster_view
 from distrace.checkpoint import Model
+from distrace.data.solid import solid_of
 from distrace.data.split import Shape
 from distrace.data.view import View, observe
-from distrace.evaluate import OBSERVATION_SIZE, solid_of
+from distrace.evaluate import OBSERVATION_SIZE
 from distrace.fit import FitConfig, fit_shape, view_terms
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh

@@ -1,6 +1,5 @@
 """Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,21 +13,27 @@ from torch import Tensor, nn
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 
+VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The schedule: a short warm-up, then a cosine down to zero at `steps`."""
+    """The schedule: a short warm-up, a constant rate, and a straight line down to zero at `steps`."""
 
     steps: int = 36_000
     samples_per_step: int = 2048  # half of them outside; small and many steps beat large and few, minute for minute
     shapes_per_step: int = 64
     learning_rate: float = 1e-3
     code_learning_rate: float = 2e-3
-    warm_up: float = 0.02  # share of the steps
+    warm_up: int = 500  # steps
+    cool_down: float = (
+        0.4  # share of the steps; until it begins, a run can be given more steps as if it had them always
+    )
     clamp: float = 0.1  # distances beyond are learnt as "far"
     code_penalty: float = 1e-4
     code_bound: float = 1.0
     code_deviation: float = 0.05  # of a code's entries at the start
+    variant_weight: float = 0.5  # how often a variant, whose name has a ~, is drawn, to once an original
     bfloat16: bool = False
     seed: int = 0
 
@@ -45,6 +50,9 @@ class Samples:
     names: list[str]
     outside: list[Float[Tensor, "_ 4"]]
     inside: list[Float[Tensor, "_ 4"]]
+
+    def weights(self, variants: float) -> Float[Tensor, "shapes"]:
+        return torch.tensor([variants if VARIANT in name else 1.0 for name in self.names])
 
     def to(self, device: torch.device) -> "Samples":
         return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
@@ -108,7 +116,7 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
     while training.step < config.steps:
         began = time.perf_counter()
         for group in training.optimiser.param_groups:
-            group["lr"] = group["peak"] * _rate(training.step / config.steps, config.warm_up)
+            group["lr"] = group["peak"] * _rate(training.step, config)
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = draw(samples, config)
         codes = training.codes[shapes]
@@ -126,7 +134,7 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
 def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:
     """A step's shapes, and as many samples inside as outside of each."""
     count = min(config.shapes_per_step, len(samples.names))
-    shapes = torch.randperm(len(samples.names))[:count]
+    shapes = torch.multinomial(samples.weights(config.variant_weight), count)
     per_side = max(config.samples_per_step // count // 2, 1)
     sides = [(samples.outside[shape], samples.inside[shape]) for shape in shapes]
     batch = [torch.cat([side[torch.randint(len(side), (per_side,))] for side in pair]) for pair in sides]
@@ -144,8 +152,10 @@ def bound_codes(codes: Tensor, bound: float) -> None:
     codes.mul_((bound / codes.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0))
 
 
-def _rate(progress: float, warm_up: float) -> float:
-    return min(1.0, progress / warm_up + 0.01) * (1 + math.cos(math.pi * progress)) / 2
+def _rate(step: int, config: TrainConfig) -> float:
+    """Of the highest one. A trapezium does what a cosine does, and can be prolonged (Hägele et al., NeurIPS 2024)."""
+    left = (config.steps - step) / (config.steps * config.cool_down)
+    return min(1.0, (step + 1) / config.warm_up, left)
 
 
 def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:

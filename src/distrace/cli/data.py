@@ -42,7 +42,7 @@ class Sample:
     split: str | None = None  # a bundled split (sofas) or a CSV file; without one, every mesh below the folder
     count: int = 500_000  # samples of each shape
     mirror: Flag = False  # also the mirror image of training shapes that have another
-    stretches: int = 0  # also so many copies of each training shape, stretched at random
+    variants: int = 0  # also so many copies of each training shape, warped at random
     workers: int = os.cpu_count() or 1
 
     def run(self) -> None:
@@ -51,11 +51,11 @@ class Sample:
             raise ValueError(
                 f"{self.meshes} is no folder of meshes; `distrace data furniture --out {self.meshes}` makes one"
             )
-        if self.count < 1000 or self.workers < 1 or self.stretches < 0:
-            given = f"--count {self.count} --workers {self.workers} --stretches {self.stretches}"
+        if self.count < 1000 or self.workers < 1 or self.variants < 0:
+            given = f"--count {self.count} --workers {self.workers} --variants {self.variants}"
             raise ValueError(f"{given} was given; at least 1000, 1 and 0 are needed")
         shapes = read_split(self.split) if self.split else every_mesh(self.meshes)
-        todo = sampling.jobs(shapes, self.meshes, self.out, self.count, self.mirror, self.stretches)
+        todo = sampling.jobs(shapes, self.meshes, self.out, self.count, self.mirror, self.variants)
         reports: list[Doubt] = []
         with progress("sampling", len(todo)) as bar:
             for report in sampling.run(todo, self.workers):

@@ -32,7 +32,7 @@ class Train:
     out: Path = Path("out/model")
     split: str | None = None  # learn only the training shapes of this split, and their variants
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
-    steps: int = TrainConfig.steps
+    steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     samples_per_step: int = TrainConfig.samples_per_step
     layers: int = 8
     width: int = 512
@@ -48,12 +48,15 @@ class Train:
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
+            config = config if self.steps is None else replace(config, steps=self.steps)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
             specs = NetworkSpecs(
                 (self.width,) * self.layers, self.code_length, (self.layers // 2,), tuple(range(self.layers))
             )
-            config = TrainConfig(steps=self.steps, samples_per_step=self.samples_per_step, seed=self.seed)
+            config = TrainConfig(
+                steps=self.steps or TrainConfig.steps, samples_per_step=self.samples_per_step, seed=self.seed
+            )
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
             training = start_training(len(loaded.names), specs, config, run.device)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)

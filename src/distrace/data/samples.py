@@ -12,7 +12,7 @@ from distrace.files import written
 from distrace.metrics import surface_points
 
 NEAR = 0.94  # the share of samples near the surface; the rest fills the unit sphere
-VARIANCES = (0.0025, 0.00025)
+VARIANCES = (0.0025, 0.00025, 0.000025)  # DeepSDF has the first two; the third is for thin legs and wings
 DOUBTFUL = 0.25  # a winding number this far from a whole number leaves the sign in doubt
 HOPELESS = 0.02  # a shape with a larger share of doubtful signs is not learnt
 
@@ -32,12 +32,12 @@ class Doubt:
 def sample(solid: Solid, count: int, seed: int) -> Float[np.ndarray, "count 4"]:
     """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""
     random = np.random.default_rng(seed)
-    near = int(NEAR * count) // 2
+    near = int(NEAR * count) // len(VARIANCES)
     surface = surface_points(solid.surface, near, seed)
-    displaced = [surface + random.normal(size=surface.shape) * variance**0.5 for variance in VARIANCES]
-    direction = random.normal(size=(count - 2 * near, 3))
+    displaced = np.concatenate([surface + random.normal(size=surface.shape) * variance**0.5 for variance in VARIANCES])
+    direction = random.normal(size=(count - len(displaced), 3))
     radius = random.random((len(direction), 1)) ** (1 / 3)
-    points = np.concatenate([*displaced, direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius])
+    points = np.concatenate([displaced, direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius])
     return np.column_stack([points, solid.distance(points)]).astype(np.float32)
 
 
@@ -50,12 +50,6 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
     usable = doubtful <= HOPELESS
     reason = "" if usable else f"{doubtful:.1%} of its signs are doubtful"
     return Doubt(name, len(solid.soup.faces), outer, doubtful, usable, reason)
-
-
-def lopsided(solid: Solid, count: int = 2000) -> bool:
-    """Whether the mirror image in x is another shape."""
-    points = surface_points(solid.surface, count, seed=0)
-    return bool(np.mean(solid.distance(points * (-1, 1, 1)) ** 2) > 2e-5)
 
 
 def write_samples(path: Path, samples: Float[np.ndarray, "n 4"]) -> None:

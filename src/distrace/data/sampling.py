@@ -10,11 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from distrace.data.samples import Doubt, doubt, lopsided, sample, write_report, write_samples
-from distrace.data.solid import Solid, load_solid, stretched, turned
+from distrace.data.samples import Doubt, doubt, sample, write_report, write_samples
+from distrace.data.solid import Solid, load_solid, turned
 from distrace.data.split import Shape
-
-STRETCH = 0.2  # each axis of a stretched variant is scaled by up to e to this
+from distrace.data.warp import lopsided, warped
 
 
 @dataclass(frozen=True)
@@ -26,20 +25,20 @@ class Job:
     out: Path
     count: int
     mirror: bool = False  # also its mirror image in x, where that is another shape
-    stretches: int = 0  # also as many copies stretched at random
+    variants: int = 0  # also as many copies warped at random
 
     def samples(self, variant: str = "") -> Path:
         return self.out / f"{self.shape.name}{variant}.npz"
 
 
-def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, stretches: int) -> list[Job]:
+def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, variants: int) -> list[Job]:
     """The shapes to sample; only those to train on have variants."""
 
     def job(shape: Shape) -> Job:
         learnt = shape.split == "train"
-        return Job(shape, meshes / shape.path, out, count, mirror and learnt, stretches if learnt else 0)
+        return Job(shape, meshes / shape.path, out, count, mirror and learnt, variants if learnt else 0)
 
-    return [job(shape) for shape in shapes]
+    return [job(shape) for shape in shapes if shape.split != "out"]
 
 
 def run(todo: list[Job], workers: int) -> Iterator[Doubt]:
@@ -81,9 +80,8 @@ def _write(job: Job, solid: Solid) -> None:
     if job.mirror and lopsided(solid):
         write_samples(job.samples("~mirrored"), samples * np.array([-1, 1, 1, 1], np.float32))
     random = np.random.default_rng(seed)
-    for number in range(1, job.stretches + 1):
-        factors = np.exp(random.uniform(-STRETCH, STRETCH, 3)) * (1 - 2 * random.integers(2), 1, 1)
-        write_samples(job.samples(f"~stretched{number}"), sample(stretched(solid, factors), job.count, seed + number))
+    for number in range(1, job.variants + 1):
+        write_samples(job.samples(f"~warped{number}"), sample(warped(solid, random), job.count, seed + number))
 
 
 def _earlier(job: Job) -> Doubt | None:

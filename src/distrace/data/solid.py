@@ -15,6 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from distrace.data.ac3d import load_ac3d
+from distrace.data.split import Shape
 from distrace.errors import explained
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
@@ -56,6 +57,17 @@ def load_solid(path: Path) -> Solid:
     return Solid(soup, surface)
 
 
+def solid_of(shape: Shape, meshes: Path) -> Solid:
+    """A shape of a split as it is learnt; its mesh lies in a catalogue's folder, `meshes` or one below.
+
+    Raises `ValueError` where it is missing, or as `load_solid` does.
+    """
+    for path in (meshes / shape.path, *sorted(meshes.glob(f"*/{shape.path}"))):
+        if path.is_file():
+            return turned(load_solid(path), shape.turn)
+    raise ValueError(f"{meshes / shape.path} is missing; `distrace data furniture` and `… planes` fetch the meshes")
+
+
 def load_soup(path: Path) -> trimesh.Trimesh:
     """All triangles of a file, as they are."""
     if path.suffix.lower() == ".ac":  # trimesh does not know AC3D
@@ -67,30 +79,19 @@ def load_soup(path: Path) -> trimesh.Trimesh:
 
 def turned(solid: Solid, degrees: float) -> Solid:
     """The solid rotated about the y axis."""
-    return _mapped(solid, np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0])))
-
-
-def stretched(solid: Solid, factors: Float[np.ndarray, "3"]) -> Solid:
-    """The solid scaled along each axis (negative: mirrored), then centred and scaled into the unit sphere again."""
-    shape = _mapped(solid, np.diag([*factors, 1.0]))
-    middle, scale = _frame(shape.soup)
-    return _mapped(shape, trimesh.transformations.scale_and_translate(scale, -middle * scale))
-
-
-def _mapped(solid: Solid, matrix: np.ndarray) -> Solid:
-    """The surface is mapped, not sought again: affine maps keep winding numbers. Trimesh turns mirrored faces."""
+    matrix = np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
     return Solid(solid.soup.copy().apply_transform(matrix), solid.surface.copy().apply_transform(matrix))
 
 
 def normalised(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     """Centred on its bounding box and scaled so that the farthest vertex lies at `RADIUS`."""
-    middle, scale = _frame(mesh)
+    middle, scale = normalised_frame(mesh)
     scaled = trimesh.Trimesh((mesh.vertices - middle) * scale, mesh.faces, process=False)
     scaled.update_faces(scaled.area_faces > 1e-14)
     return scaled
 
 
-def _frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
+def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
     """The middle of the bounding box, and what scales the farthest vertex to `RADIUS`."""
     used = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]
     if not len(used) or not np.isfinite(used).all():

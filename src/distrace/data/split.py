@@ -1,7 +1,7 @@
 """Which shapes a model is trained on and which are held out, fixed in a file: `splits/sofas.csv`."""
 
 import csv
-from dataclasses import dataclass
+from dataclasses import MISSING, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
 
@@ -15,12 +15,16 @@ class Shape:
     """A mesh, where it lies in its catalogue, and which side of the split its design is on."""
 
     name: str
-    split: str  # train or test
+    split: str  # train, test, or out of both
     design: str  # close variants of one design stay on one side
     turn: float  # degrees about y that bring it to the orientation of its class
     path: str
     creator: str
     licence: str
+    note: str = ""  # why it is out
+
+
+COLUMNS = [field.name for field in fields(Shape) if field.default is MISSING]
 
 
 def read_split(name: str | Path) -> list[Shape]:
@@ -31,10 +35,10 @@ def read_split(name: str | Path) -> list[Shape]:
     bundled = files("distrace") / "splits" / f"{name}.csv"
     source = bundled if bundled.is_file() else Path(name)
     if not source.is_file():
-        raise ValueError(f"there is no split {name}: give the name of a bundled one (sofas) or a CSV file")
+        raise ValueError(f"there is no split {name}: give the name of a bundled one ({_bundled()}) or a CSV file")
     with explained(f"the split {name} cannot be read as a CSV file"):
         rows = csv.DictReader(source.read_text(encoding="utf-8").splitlines())
-        missing = [column for column in Shape.__dataclass_fields__ if column not in (rows.fieldnames or [])]
+        missing = [column for column in COLUMNS if column not in (rows.fieldnames or [])]
     if missing:
         raise ValueError(f"the split {name} lacks the columns {', '.join(missing)}")
     with explained(f"the split {name} cannot be read: each row needs all of its columns, and degrees as its turn"):
@@ -42,10 +46,14 @@ def read_split(name: str | Path) -> list[Shape]:
 
 
 def _shape(row: dict[str, str]) -> Shape:
-    known = {column: row[column] for column in Shape.__dataclass_fields__}
+    known = {column: row[column] for column in Shape.__dataclass_fields__ if column in row}
     if None in known.values():
         raise ValueError(f"{', '.join(filter(None, known.values()))} is too short")
     return Shape(**{**known, "turn": float(row["turn"])})
+
+
+def _bundled() -> str:
+    return ", ".join(sorted(Path(entry.name).stem for entry in (files("distrace") / "splits").iterdir()))
 
 
 def every_mesh(folder: Path) -> list[Shape]:

@@ -1,0 +1,54 @@
+"""What the shape of a code lacks of points whose distances are known, and its exact derivatives by the code."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.code_residuals import derivatives, with_prior
+from distrace.decoder import Decoder
+from distrace.prior import Prior
+from distrace.solver import Residuals
+
+CLAMP = 0.1  # what is farther than this, on the right side, is right: decoders say no more
+
+
+@dataclass(frozen=True)
+class Coordinates:
+    """Of a code."""
+
+    w: Float[Tensor, "dimensions"]
+
+
+@dataclass
+class PointProblem:
+    """Residuals f(p) − d of a code's coordinates at fixed points; surface points have d = 0."""
+
+    decoder: Decoder
+    prior: Prior
+    samples: Float[Tensor, "n 4"]
+    weight: float  # of the mean deviation
+    code_weight: float  # of the mean squared coordinate
+    scale: float
+    evaluations: int = 0
+
+    def look(self, w: Float[Tensor, "dimensions"]) -> Coordinates:
+        return Coordinates(w)
+
+    def moved(self, at: Coordinates, step: Float[Tensor, "dimensions"]) -> Coordinates:
+        return Coordinates(at.w + step)
+
+    def residuals(self, at: Coordinates) -> Residuals:
+        w, distances = at.w, self.samples[:, 3]
+        values, _, by_code = derivatives(self.decoder, self.samples[:, :3], self.prior.code(w))
+        self.evaluations += len(values)
+        far = (values.abs() > CLAMP) & (distances.abs() > CLAMP) & (values.sign() == distances.sign())
+        lacking = (values - distances).masked_fill(far, 0.0)
+        jacobian = (by_code @ self.prior.basis).masked_fill(far[:, None], 0.0)
+        weights = torch.full_like(lacking, self.weight / len(lacking) / self.scale)
+        return with_prior(lacking, jacobian, weights, w, self.code_weight)
+
+    def terms(self, at: Coordinates, residuals: Residuals) -> dict[str, float]:
+        distance = residuals.values[: len(self.samples)].abs().mean()
+        return {"distance": self.weight * float(distance), "code": self.code_weight * float(at.w.square().mean())}

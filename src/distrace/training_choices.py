@@ -1,0 +1,92 @@
+"""What a class is best learnt from: small networks trained on its shapes and on more and more variants of them."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import mean, median
+
+import torch
+
+from distrace.checkpoint import Model
+from distrace.data.solid import solid_of
+from distrace.data.split import Shape, read_split
+from distrace.decoder import NetworkSpecs
+from distrace.evaluate import best_told, compared
+from distrace.train import TrainConfig, load_samples, start, train
+
+SPECS = NetworkSpecs((256,) * 8)
+SHOWN = 10  # training shapes that are compared
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Which files of samples are learnt, and how."""
+
+    name: str
+    learnt: Callable[[str], bool]  # of a variant: "" of the shape itself, "mirrored", "warped1" …
+    config: TrainConfig = TrainConfig()
+
+
+@dataclass(frozen=True)
+class ChoiceRow:
+    """Chamfer distances of some training shapes, and of the held-out ones fitted to all of their distances."""
+
+    choice: str
+    codes: int
+    steps: int
+    train_mean: float
+    held_out_median: float
+    held_out_mean: float
+
+
+def choices() -> list[Choice]:
+    return [
+        Choice("the shapes alone", lambda variant: not variant),
+        Choice("and mirrored", lambda variant: not variant.startswith("warped")),
+        Choice("and warped twice", lambda variant: variant not in ("warped3", "warped4")),
+        Choice("and warped four times", lambda variant: True),
+        Choice("… drawn as often as shapes", lambda variant: True, TrainConfig(variant_weight=1.0)),
+        Choice("… codes held ten times tighter", lambda variant: True, TrainConfig(code_penalty=1e-3)),
+    ]
+
+
+def choice_rows(samples: Path, split: str, meshes: Path, steps: int, resolution: int) -> Iterator[ChoiceRow]:
+    """Each choice with as many steps. Raises `ValueError` for missing samples or meshes."""
+    shapes = read_split(split)
+    learnt = [shape.name for shape in shapes if shape.split == "train"]
+    for choice in choices():
+        paths = [
+            path
+            for name in learnt
+            for path in sorted(samples.glob(f"{name}.npz")) + sorted(samples.glob(f"{name}~*.npz"))
+            if choice.learnt(path.stem.partition("~")[2])
+        ]
+        if not paths:
+            raise ValueError(f"{samples} holds no samples of {split}; `distrace sample --split {split}` makes them")
+        model = _trained(paths, replace(choice.config, steps=steps))
+        yield _row(choice.name, model, shapes, meshes, steps, resolution)
+
+
+def _trained(paths: list[Path], config: TrainConfig) -> Model:
+    loaded = load_samples(paths)
+    training = start(len(paths), SPECS, config, torch.device("cpu"))
+    for _ in train(loaded, training, config):
+        pass
+    training.decoder.eval().requires_grad_(False)
+    return Model("choice", training.decoder, training.codes.detach(), tuple(loaded.names))
+
+
+def _row(name: str, model: Model, shapes: list[Shape], meshes: Path, steps: int, resolution: int) -> ChoiceRow:
+    known = [shape for shape in shapes if shape.name in model.shapes]
+    some = known[:: max(len(known) // SHOWN, 1)]
+    codes = [model.codes[model.shapes.index(shape.name)] for shape in some]
+    told = [
+        compared(shape.name, name, 0, model, code, solid_of(shape, meshes).surface, 0.0, resolution).chamfer
+        for shape, code in zip(some, codes, strict=True)
+    ]
+    unseen = [
+        best_told(model, shape.name, solid_of(shape, meshes), resolution).chamfer
+        for shape in shapes
+        if shape.split == "test"
+    ]
+    return ChoiceRow(name, len(model.codes), steps, mean(told), median(unseen), mean(unseen))

@@ -1,0 +1,34 @@
+"""Experiments of many trials that do not depend on each other: in processes, going on where they were stopped."""
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, TypeVar
+
+import torch
+
+from distrace.errors import explained
+
+Trial = TypeVar("Trial")
+Result = TypeVar("Result")
+
+
+def each_done(work: Callable[[Trial], Result], wanted: Sequence[Trial], jobs: int) -> Iterator[Result]:
+    """The result of each trial, as it is done; in so many processes of one thread each."""
+    with ProcessPoolExecutor(
+        jobs, mp_context=get_context("spawn"), initializer=torch.set_num_threads, initargs=(1,)
+    ) as pool:
+        pending = [pool.submit(work, trial) for trial in wanted]
+        try:
+            for done in as_completed(pending):
+                yield done.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def read_json(path: Path) -> Any:
+    """What a trial left. Raises `ValueError` for a file that is not JSON."""
+    with explained(f"{path} holds no trials; remove it to begin anew"):
+        return json.loads(path.read_text())
