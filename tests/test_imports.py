@@ -38,6 +38,7 @@ ORDER = [
         "gradients",
         "backward",
         "methods",
+        "plausible",
         "evaluate",
         "solvers",
         "training_choices",

@@ -13,7 +13,7 @@ from distrace.page import Html, figure, page, paragraph, section, table
 from distrace.render import render
 from distrace.report import View
 from distrace.shading import Picture, grid
-from distrace.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, opened, true_solid
+from distrace.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, true_solid
 
 PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than ours (Liu et al., CVPR 2020, table 3)
     ("sofa", "DeepSDF"): (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
@@ -158,7 +158,7 @@ def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Pl
 
 
 def _shaded(each: Done, camera: Camera, place: Place) -> Picture:
-    model = opened(dict(place.models).get(each.trial.category, each.trial.category))
+    model = place.model_of(each.trial.category)
     with torch.no_grad():
         return View.of(render(model.field(torch.tensor(each.code)), camera)).shaded
 

@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from distrace.checkpoint import Model
+from distrace.data.cloud import Cloud
 from distrace.data.view import View
 from distrace.fit import FitConfig, fit_shape
 from distrace.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.fit_samples import SampleFitConfig, around_points, fit_samples, on_surface
-from distrace.prior import prior_of
+from distrace.prior import Prior, prior_of
 from distrace.starts import Step
 
 METHODS = ("deepsdf", "ours", "ours+mask")  # of the published table
@@ -21,21 +22,27 @@ def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitC
 
     Raises `ValueError` for another method.
     """
-    prior, points = prior_of(model.codes), view.points()
+    if method not in METHODS + CLOUDS:
+        raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS + CLOUDS)}")
+    cloud = Cloud(view.points(), None if view.normal is None else view.normal[view.seen])
     if method == "deepsdf":
-        return fit_samples(model.decoder, around_points(points, _normals(view)), SampleFitConfig(samples=SAMPLES))
+        assert cloud.normals is not None, "DeepSDF is given the true normals"
+        samples = around_points(cloud.points, cloud.normals)
+        return fit_samples(model.decoder, samples, SampleFitConfig(samples=SAMPLES))
     if method in CLOUDS:
-        samples = on_surface(points) if method == "points" else around_points(points, _normals(view))
+        return completing(model, cloud if method == "points+normals" else cloud.without("normal"), config)
+    return completing(model, replace(view, normal=None, mask=view.mask if method == "ours+mask" else None), config)
+
+
+def completing(
+    model: Model, seen: View | Cloud, config: FitConfig | CodeFitConfig, prior: Prior | None = None
+) -> Iterator[Step]:
+    """Ours: from a view by either solver, from points by Levenberg–Marquardt; a prior replaces that of the codes."""
+    prior = prior_of(model.codes) if prior is None else prior
+    if isinstance(seen, Cloud):
+        samples = on_surface(seen.points) if seen.normals is None else around_points(seen.points, seen.normals)
         settings = config if isinstance(config, CodeFitConfig) else CodeFitConfig(seed=config.seed)
         return fit_points(model.decoder, samples, prior, settings)
-    if method not in METHODS:
-        raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS + CLOUDS)}")
-    known = replace(view, normal=None, mask=view.mask if method == "ours+mask" else None)
     if isinstance(config, CodeFitConfig):
-        return fit_code(model.decoder, [known], prior, config)
-    return fit_shape(model.decoder, [known], prior, config)
-
-
-def _normals(view: View):
-    assert view.normal is not None, "this method is given the true normals"
-    return view.normal[view.seen]
+        return fit_code(model.decoder, [seen], prior, config)
+    return fit_shape(model.decoder, [seen], prior, config)

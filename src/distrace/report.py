@@ -1,5 +1,6 @@
 """The page of a completed shape: what was observed, what was made of it, and how far that is from the truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,13 +51,14 @@ class Completion:
     truth_points: Float[np.ndarray, "m 3"] | None
     chamfer: Chamfer | None
     facts: dict[str, str]
+    others: Sequence[Sequence[Picture]] = ()  # from the camera and from behind: how far others are apart, and each
     chosen: str | None = None  # the name of the curve whose result is shown
 
 
 def completion_page(completion: Completion) -> str:
     """What was observed, what was made of it, and how far that is from the truth."""
     count = f"{len(completion.points_world):,}"
-    lead = f"A whole surface from {count} points of one depth view: what was observed, the fitted shape and its errors."
+    lead = f"A whole surface from {count} points: what was observed, the fitted shape and its errors."
     sections = [
         _observed(completion),
         _shapes(completion),
@@ -65,6 +67,7 @@ def completion_page(completion: Completion) -> str:
         _silhouettes(completion),
         _depths(completion),
         _normals(completion),
+        *([_others(completion)] if completion.others else []),
         _losses(completion),
         section("Facts", table(("", ""), list(completion.facts.items()))),
     ]
@@ -184,6 +187,20 @@ def _normals(completion: Completion) -> Html:
     figures = [figure(shading.normal_picture(view.normal, view.mask), name) for name, view in states]
     axes = key({"faces +x": (255, 128, 128), "faces +y, up": (128, 255, 128), "faces +z": (128, 128, 255)})
     return section("Normals", row(*figures), axes)
+
+
+def _others(completion: Completion) -> Html:
+    about = (
+        "Each is fitted to the same observation, from another guess of what was not seen. Coloured: how far their"
+        " surfaces are from the completed one, in radii of the sphere; the lower row is seen from behind."
+    )
+    colours = shading.error_picture(np.linspace(0, 1, 9)[None], 1)
+    return section(
+        "Other shapes that fit",
+        paragraph(about),
+        figure(shading.grid(completion.others), "How far apart, and the others"),
+        ramp("0", "0.1 and more", colours),
+    )
 
 
 def _losses(completion: Completion) -> Html:

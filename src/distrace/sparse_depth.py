@@ -48,7 +48,7 @@ class Trial:
     @property
     def file(self) -> str:
         parts = (self.shape, self.view, self.density, self.noise, f"{self.focal_ratio:g}", self.method)
-        return f"{self.category}/{'_'.join(map(str, parts))}.json"
+        return f"{Path(self.category).stem}/{'_'.join(map(str, parts))}.json"
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,11 @@ class Place:
 
     meshes: Path  # a folder for each source, as `distrace data` makes them
     out: Path
-    models: tuple[tuple[str, str], ...] = ()  # a category's model, where it has not the same name
+    models: tuple[tuple[str, str], ...]  # of each category
     resolution: int = 192  # of the meshes that are compared
+
+    def model_of(self, category: str) -> Model:
+        return _opened(dict(self.models)[category])
 
 
 @dataclass(frozen=True)
@@ -145,7 +148,7 @@ def observed(trial: Trial, meshes: Path) -> View:
 
 def done(place: Place, trial: Trial) -> Done:
     """A trial's result: that of an earlier run with the same model, or a new one, which it leaves in a file."""
-    path, model = place.out / "trials" / trial.file, opened(dict(place.models).get(trial.category, trial.category))
+    path, model = place.out / "trials" / trial.file, place.model_of(trial.category)
     mark = fingerprint(model)
     if path.is_file():
         kept = read_json(path)
@@ -181,7 +184,7 @@ def true_solid(meshes: Path, category: str, name: str) -> Solid:
 
 
 @lru_cache
-def opened(name: str) -> Model:
+def _opened(name: str) -> Model:
     return load_model(name)
 
 

@@ -49,7 +49,8 @@ class Evaluate:
     seed: int = 0
     resolution: int = 256  # of the meshes that are compared
     classes: tuple[str, ...] = ("sofas", "planes", "tables", "chairs")  # of the last three
-    methods: tuple[str, ...] = METHODS
+    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
     shapes: int | None = None  # held-out ones of each class; by default all
     views: int = 4  # of each shape
     cameras: int = 50  # of `pose`, for each observation and each disturbance
@@ -69,7 +70,11 @@ class Evaluate:
         if self.jobs < 1 or not 1 <= self.views <= len(AZIMUTHS_ELEVATIONS) or (self.shapes or 1) < 1:
             given = f"--jobs {self.jobs} --views {self.views} --shapes {self.shapes}"
             raise ValueError(f"{given} was given; at least 1 of each are needed, and at most 4 views")
-        place = Place(self.meshes.resolve(), run.out.resolve(), resolution=self.resolution)
+        models = self.models or self.classes
+        if len(models) != len(self.classes):
+            given = f"{len(models)} models ({', '.join(models)}) were given"
+            raise ValueError(f"{given} for {len(self.classes)} classes ({', '.join(self.classes)}); give one each")
+        place = Place(self.meshes, run.out, tuple(zip(self.classes, models, strict=True)), self.resolution)
         trials = all_trials(self.classes, self.methods, CONDITIONS[self.name](), self.shapes, self.views)
         results: list[Done] = []
         with progress(self.name, len(trials)) as bar:

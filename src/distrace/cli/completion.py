@@ -1,0 +1,171 @@
+"""A completion as a command runs it: fitted, meshed, measured, and shown on a page."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+
+from distrace import report, shading
+from distrace.bench import poster_view
+from distrace.camera import Camera
+from distrace.checkpoint import Model
+from distrace.cli.common import save_mesh
+from distrace.cli.console import Run, console, progress
+from distrace.data.cloud import Cloud
+from distrace.data.view import View
+from distrace.files import written
+from distrace.fit import FitConfig
+from distrace.fit_code import CodeFitConfig
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.methods import completing
+from distrace.metrics import Chamfer, chamfer
+from distrace.plausible import plausible, spread
+from distrace.prior import prior_of
+from distrace.render import render
+from distrace.starts import Step
+
+Surface = trimesh.Trimesh | np.ndarray
+CLOUD_SIZE = 256  # pixels of the pictures of a cloud's completion
+SMALL = 144  # pixels, of pictures of which there are many
+SPREAD = 0.1  # that is drawn in the fullest colour
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is to be completed, and how."""
+
+    model: Model
+    full: View | Cloud  # all that was observed
+    known: View | Cloud  # what may be used of it
+    truth: Surface | None
+    fit: FitConfig | CodeFitConfig
+    mesh: MeshConfig
+    plausible: int = 0  # other completions
+
+    @property
+    def camera(self) -> Camera:
+        """That of the view; clouds are shown from in front and above."""
+        return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
+
+    def shown(self, seen: View | Cloud) -> View:
+        return seen.seen_from(self.camera) if isinstance(seen, Cloud) else seen
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """A fit, and everything that it took."""
+
+    steps: list[Step]
+    others: list[Step]
+    mesh: trimesh.Trimesh
+    chamfer: Chamfer | None
+
+    @property
+    def evaluations(self) -> int:
+        return sum(step.evaluations for step in (*self.steps, *self.others))
+
+
+def complete(run: Run, task: Task) -> None:
+    """Fits, and writes mesh, code, pictures, page and `result.json`."""
+    outcome = _fitted(task)
+    last = outcome.steps[-1]
+    save_mesh(run.out / "mesh.ply", outcome.mesh)
+    with written(run.out / "code.npy") as file:
+        np.save(file, last.code.cpu().numpy())
+    for step in outcome.others:
+        mesh = extract_mesh(task.model.field(step.code), task.mesh)
+        save_mesh(run.out / f"plausible-{step.start + 1}.ply", mesh)
+    page = _story(task, outcome)
+    shading.save_png(run.out / "shaded.png", page.after.shaded)
+    with written(run.out / "report.html") as file:
+        file.write(report.completion_page(page).encode())
+    facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
+    distances = outcome.chamfer
+    if distances:
+        console.print(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
+        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+    run.finish({**facts, "setup_evaluations": 0})
+
+
+def _fitted(task: Task) -> Outcome:
+    steps: list[Step] = []
+    with progress("fitting", task.fit.total) as bar:
+        for step in completing(task.model, task.known, task.fit):
+            steps.append(step)
+            bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+    others = list(_others(task))
+    mesh = extract_mesh(task.model.field(steps[-1].code), task.mesh)
+    if others and len(mesh.faces):
+        codes = [step.code for step in others]
+        vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
+        mesh.vertex_attributes["spread"] = spread(task.model, codes, vertices).cpu().numpy()
+    return Outcome(steps, others, mesh, None if task.truth is None else chamfer(mesh, task.truth))
+
+
+def _others(task: Task) -> Iterator[Step]:
+    if task.plausible:
+        with progress("other completions", task.plausible) as bar:
+            for step in plausible(task.model, task.known, task.plausible, seed=task.fit.seed):
+                yield step
+                bar.advance(f"loss {step.loss:.4f}")
+
+
+def _story(task: Task, outcome: Outcome) -> report.Completion:
+    """All that the page shows."""
+    known, full, truth, last = task.shown(task.known), task.shown(task.full), task.truth, outcome.steps[-1]
+    losses: dict[str, list[float]] = {}
+    for step in outcome.steps:
+        losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
+    with torch.no_grad():
+        codes = (prior_of(task.model.codes).mean, last.code)
+        camera = task.camera.to(task.mesh.device)
+        before, after = (report.View.of(render(task.model.field(code), camera)) for code in codes)
+    points = task.known.points if isinstance(task.known, Cloud) else known.points()
+    facts = {
+        "points used": str(len(points)),
+        "silhouette": "none" if known.mask is None else "used",
+        "iterations": f"{task.fit.iterations}, after {task.fit.tried} of each of {task.fit.starts} starts",
+        "evaluations of the network": f"{outcome.evaluations:,}",
+        "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
+        "seed": str(task.fit.seed),
+    }
+    return report.Completion(
+        title=f"A shape completed from {'points' if isinstance(task.known, Cloud) else 'one depth view'}",
+        observed_depth=known.depth.numpy(),
+        observed_mask=None if known.mask is None else known.mask.numpy(),
+        points_world=points.numpy(),
+        before=before,
+        after=after,
+        truth=None if task.known is task.full else _truth_view(full),
+        others=_other_pictures(task, outcome) if outcome.others else [],
+        losses=losses,
+        mesh=outcome.mesh,
+        truth_points=truth.vertices if isinstance(truth, trimesh.Trimesh) else truth,
+        chamfer=outcome.chamfer,
+        facts=facts,
+        chosen=f"start {outcome.steps[-1].start + 1}",
+    )
+
+
+@torch.no_grad()
+def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]:
+    """From the camera and from behind: how far the others are from the completed surface, and each of them."""
+    camera = task.camera.to(task.mesh.device)
+    camera, model, codes = camera.resized(SMALL / camera.height), task.model, [step.code for step in outcome.others]
+    rows = []
+    for eye in (camera, camera.turned(180.0)):
+        buffers = render(model.field(outcome.steps[-1].code), eye)
+        apart = torch.full_like(buffers.depth, torch.nan)
+        apart[buffers.mask] = spread(model, codes, buffers.points)
+        others = [report.View.of(render(model.field(code), eye)).shaded for code in codes]
+        rows.append([shading.error_picture(apart.cpu().numpy(), SPREAD), *others])
+    return rows
+
+
+def _truth_view(full: View) -> report.View | None:
+    """What the observation holds beyond what was used, where it holds all of it."""
+    if full.mask is None or full.normal is None or full.shaded is None:
+        return None
+    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)

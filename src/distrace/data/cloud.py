@@ -1,0 +1,75 @@
+"""Points of a surface, as a scanner gives them: no camera, perhaps normals. The file form is PLY."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.data.checks import ALMOST
+from distrace.data.view import View
+from distrace.errors import about, explained
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Surface points in the frame of the unit sphere; normals, if known, point out of the shape."""
+
+    points: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"] | None = None
+
+    def sparse(self, count: int, seed: int = 0) -> "Cloud":
+        """At most so many of the points, drawn at random."""
+        chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
+        return Cloud(self.points[chosen], None if self.normals is None else self.normals[chosen])
+
+    def without(self, *parts: str) -> "Cloud":
+        return replace(self, normals=None) if "normal" in parts else self
+
+    def seen_from(self, camera: Camera) -> View:
+        """The points as depths of the pixels that they fall into, the nearest of each; none hides another's pixel."""
+        pixels, depths = camera.project(self.points)
+        column, row = pixels.floor().long().unbind(-1)
+        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (depths > 0)
+        flat = torch.full((camera.height * camera.width,), torch.inf)
+        flat.scatter_reduce_(0, (row * camera.width + column)[inside], depths[inside], "amin")
+        return View(camera, flat.reshape(camera.height, camera.width))
+
+
+def load_cloud(path: Path) -> Cloud:
+    """Reads points, or a mesh's vertices, and their normals where the file has them.
+
+    Raises `ValueError`, in one sentence, for what holds none or makes no sense.
+    """
+    with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere"):
+        loaded: Any = trimesh.load(path, process=False)
+        points = torch.tensor(np.asarray(loaded.vertices), dtype=torch.float32)
+        normals = _normals(loaded)
+    with about(path):
+        if not len(points) or not torch.isfinite(points).all():
+            raise ValueError(f"it has {len(points)} points, some perhaps not finite; some, and finite ones, are needed")
+        away = points.norm(dim=-1).median().item()
+        if away > ALMOST or away < ALMOST / 100:
+            raise ValueError(
+                f"its points lie {away:.3g} from the origin in the median, but the shape must be in the unit sphere"
+                " around the origin: centre it and divide by its largest radius"
+            )
+    return Cloud(points, normals)
+
+
+def _normals(loaded: Any) -> Float[Tensor, "n 3"] | None:
+    """Those of the file, of unit length; a mesh's are not made up."""
+    vertices = loaded.metadata.get("_ply_raw", {}).get("vertex", {})
+    names = ("nx", "ny", "nz")
+    if not set(names) <= set(vertices.get("properties", ())):
+        return None
+    columns = [np.asarray(vertices["data"][name]).reshape(-1) for name in names]
+    normals = torch.tensor(np.stack(columns, axis=-1), dtype=torch.float32)
+    if not torch.isfinite(normals).all() or (normals.norm(dim=-1) < 1e-6).any():
+        raise ValueError("some normals have no direction")
+    return torch.nn.functional.normalize(normals, dim=-1)

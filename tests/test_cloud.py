@@ -1,0 +1,87 @@
+"""Points without a camera: reading them, what is wrong with them, and the shapes that they make with an untrained net."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+from distrace.camera import Camera
+from distrace.data.cloud import Cloud, load_cloud
+
+BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+
+
+def ply(path: Path, points: np.ndarray, names: str = "x y z") -> Path:
+    head = "ply\nformat ascii 1.0\n" + f"element vertex {len(points)}\n"
+    head += "".join(f"property float {name}\n" for name in names.split()) + "end_header\n"
+    path.write_text(head + "\n".join(" ".join(map(str, point)) for point in points.tolist()) + "\n")
+    return path
+
+
+def test_a_cloud_is_read_with_its_normals_made_unit_length(tmp_path: Path) -> None:
+    vertices = np.asarray(BALL.vertices)
+    plain = load_cloud(ply(tmp_path / "plain.ply", vertices))
+    np.testing.assert_allclose(plain.points.numpy(), vertices, atol=1e-6)
+    assert plain.normals is None
+    both = load_cloud(ply(tmp_path / "both.ply", np.hstack([vertices, 3 * vertices]), "x y z nx ny nz"))
+    assert both.normals is not None
+    np.testing.assert_allclose(both.normals.numpy(), vertices / 0.6, atol=1e-5)
+
+
+@pytest.mark.parametrize("binary", [True, False])
+def test_a_mesh_is_its_vertices_and_its_normals_are_only_those_of_the_file(tmp_path: Path, binary: bool) -> None:
+    path = tmp_path / "mesh.ply"
+    path.write_bytes(BALL.export(file_type="ply", encoding="binary" if binary else "ascii", vertex_normal=False))
+    assert load_cloud(path).normals is None
+    path.write_bytes(BALL.export(file_type="ply", encoding="binary" if binary else "ascii", vertex_normal=True))
+    normals = load_cloud(path).normals
+    assert normals is not None
+    np.testing.assert_allclose(normals.numpy(), BALL.vertex_normals, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("points", "names", "reason"),
+    [
+        (np.asarray(BALL.vertices) * 1000, "x y z", r"points lie 600 from the origin .* divide by its largest radius"),
+        (np.asarray(BALL.vertices) * 1e-3, "x y z", r"points lie 0\.0006 from the origin"),
+        (np.full((5, 3), np.nan), "x y z", "perhaps not finite"),
+        (np.zeros((0, 3)), "x y z", "cannot be read|it has 0 points"),
+        (np.hstack([np.full((5, 3), 0.5), np.zeros((5, 3))]), "x y z nx ny nz", "some normals have no direction"),
+    ],
+)
+def test_what_makes_no_sense_is_told_in_one_sentence(
+    tmp_path: Path, points: np.ndarray, names: str, reason: str
+) -> None:
+    path = ply(tmp_path / "cloud.ply", points, names)
+    with pytest.raises(ValueError, match=reason) as caught:
+        load_cloud(path)
+    assert str(path) in str(caught.value)
+
+
+@pytest.mark.parametrize("content", [b"", b"no cloud\n", None], ids=["empty", "words", "missing"])
+def test_what_is_no_cloud_is_named(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "cloud.ply"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(ValueError, match="cannot be read as a cloud of points"):
+        load_cloud(path)
+
+
+def test_points_are_seen_where_they_are_the_nearest_of_a_pixel() -> None:
+    camera = Camera.orbit(0, 0, 3.0, height=8, width=8, focal_px=8.0)
+    points = torch.tensor([[0.02, -0.02, 0.5], [0.02, -0.02, -0.5], [0.9, 0.02, 0.0], [0.0, 0.0, 5.0]])
+    view = Cloud(points).seen_from(camera)
+    assert view.seen.sum() == 2
+    assert view.depth[4, 4].item() == pytest.approx(2.5)
+    assert view.depth[3, 6].item() == pytest.approx(3.0)
+
+
+def test_a_part_keeps_points_and_normals_together() -> None:
+    points = torch.rand(40, 3)
+    part = Cloud(points, points).sparse(7, seed=1)
+    assert part.normals is not None
+    assert torch.equal(part.points, part.normals)
+    assert len(part.points) == 7
+    assert part.without("normal").normals is None
