@@ -1,4 +1,4 @@
-"""Points without a camera: reading them, what is wrong with them, and the shapes that they make with an untrained net."""
+"""Points without a camera: reading them, what is wrong with them, and what of them a camera sees."""
 
 from pathlib import Path
 

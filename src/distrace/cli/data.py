@@ -56,13 +56,19 @@ class Sample:
             raise ValueError(f"{given} was given; at least 1000, 1 and 0 are needed")
         shapes = read_split(self.split) if self.split else every_mesh(self.meshes)
         todo = sampling.jobs(shapes, self.meshes, self.out, self.count, self.mirror, self.variants)
-        reports: list[Doubt] = []
-        with progress("sampling", len(todo)) as bar:
-            for report in sampling.run(todo, self.workers):
-                reports.append(report)
-                bar.advance(report.name)
-                if not report.usable:
-                    console.print(f"left out {report.name}: {report.reason}", markup=False)
+        reports = sampled(todo, self.workers)
         rows = [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
         usable = sum(report.usable for report in reports)
         run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows, **origin()})
+
+
+def sampled(todo: list[sampling.Job], workers: int) -> list[Doubt]:
+    """Does the jobs, and says which shapes are left out and why."""
+    reports: list[Doubt] = []
+    with progress("sampling", len(todo)) as bar:
+        for report in sampling.run(todo, workers):
+            reports.append(report)
+            bar.advance(report.name)
+            if not report.usable:
+                console.print(f"left out {report.name}: {report.reason}", markup=False)
+    return reports

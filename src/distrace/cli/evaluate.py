@@ -1,16 +1,19 @@
 """`evaluate`: tables of results, as JSON, as pictures and in the terminal."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Annotated
 
 import tyro
 
-from distrace import depth_tables, pose_table, shading
+from distrace import pose_table, shading
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
-from distrace.data.split import read_split
+from distrace.cli.evaluate_data import Card, Choices, Splits
+from distrace.cli.evaluate_depth import Focal, Noise, SparseDepth, Spread
+from distrace.data.split import Shape, read_split
 from distrace.evaluate import (
     Result,
     completion_results,
@@ -23,7 +26,6 @@ from distrace.files import save_json, save_text
 from distrace.fit import FitConfig
 from distrace.methods import METHODS
 from distrace.page import figure, page, section, table
-from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, all_trials, done
 from distrace.trials import each_done
 
 SHORT = {
@@ -34,67 +36,67 @@ SHORT = {
 
 
 @dataclass(frozen=True)
-class Evaluate:
-    """Make a table of results; what was done is kept, and a second run goes on from there."""
+class Training:
+    """How well a model knows the shapes that it was trained on."""
 
-    name: tyro.conf.Positional[Literal["training", "held-out", "completion", "pose", "sparse-depth", "noise", "focal"]]
-    """training: how well a model knows its shapes; held-out: and others, told all distances; completion: from one view;
-    pose: how often a camera is found; sparse-depth, noise, focal: completion of each class from fewer, from disturbed
-    depths, and at other focal lengths"""
     model: ModelName = "sofas"
     split: str | None = None  # by default that of the model's name
     meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
     out: Path = Path("out/evaluate")
-    points: int = 100  # observed depths, of `completion`
+    resolution: int = 256  # of the meshes that are compared
+
+    def run(self) -> None:
+        run, shapes = start(self.out), read_split(self.split or self.model)
+        results = training_results(opened(self.model, run.device), shapes, self.meshes, self.resolution)
+        _recorded(run, "training", self.model, results, _count(shapes, "train"))
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """How well a model can say the shapes that it was not trained on, told distances all around them."""
+
+    model: ModelName = "sofas"
+    split: str | None = None  # by default that of the model's name
+    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    out: Path = Path("out/evaluate")
+    resolution: int = 256  # of the meshes that are compared
+
+    def run(self) -> None:
+        run, shapes = start(self.out), read_split(self.split or self.model)
+        results = held_out_results(opened(self.model, run.device), shapes, self.meshes, self.resolution)
+        _recorded(run, "held-out", self.model, results, _count(shapes, "test"))
+
+
+@dataclass(frozen=True)
+class Completion:
+    """Held-out shapes completed from some depths of one view, by DeepSDF and by Adam on renderings."""
+
+    model: ModelName = "sofas"
+    split: str | None = None  # by default that of the model's name
+    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    out: Path = Path("out/evaluate")
+    points: int = 100  # observed depths
     seed: int = 0
     resolution: int = 256  # of the meshes that are compared
-    classes: tuple[str, ...] = ("sofas", "planes", "tables", "chairs")  # of the last three
-    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
-    methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
-    shapes: int | None = None  # held-out ones of each class; by default all
-    views: int = 4  # of each shape
-    cameras: int = 50  # of `pose`, for each observation and each disturbance
-    jobs: int = 2  # processes, of all but the first three
+
+    def run(self) -> None:
+        run, shapes, config = start(self.out), read_split(self.split or self.model), FitConfig(seed=self.seed)
+        model = opened(self.model, run.device)
+        results = completion_results(model, shapes, self.meshes, self.points, config, self.resolution)
+        _recorded(run, "completion", self.model, results, _count(shapes, "test") * len(METHODS))
+
+
+@dataclass(frozen=True)
+class Pose:
+    """How often a camera is found from one view; a second run goes on with what its `trials.json` lacks."""
+
+    model: ModelName = "sofas"
+    out: Path = Path("out/evaluate")
+    cameras: int = 50  # for each observation and each disturbance
+    jobs: int = 2  # processes
 
     def run(self) -> None:
         run = start(self.out)
-        if self.name == "pose":
-            self._pose(run)
-        elif self.name in depth_tables.AXES:
-            self._depth(run)
-        else:
-            self._shapes(run)
-
-    def _depth(self, run: Run) -> None:
-        """Each trial leaves a file in `trials`."""
-        if self.jobs < 1 or not 1 <= self.views <= len(AZIMUTHS_ELEVATIONS) or (self.shapes or 1) < 1:
-            given = f"--jobs {self.jobs} --views {self.views} --shapes {self.shapes}"
-            raise ValueError(f"{given} was given; at least 1 of each are needed, and at most 4 views")
-        models = self.models or self.classes
-        if len(models) != len(self.classes):
-            given = f"{len(models)} models ({', '.join(models)}) were given"
-            raise ValueError(f"{given} for {len(self.classes)} classes ({', '.join(self.classes)}); give one each")
-        place = Place(self.meshes, run.out, tuple(zip(self.classes, models, strict=True)), self.resolution)
-        trials = all_trials(self.classes, self.methods, CONDITIONS[self.name](), self.shapes, self.views)
-        results: list[Done] = []
-        with progress(self.name, len(trials)) as bar:
-            for each in each_done(partial(done, place), trials, self.jobs):
-                results.append(each)
-                bar.advance(f"{each.trial.shape}, {each.trial.method}: {each.chamfer:.2f}")
-        place_of = {trial: number for number, trial in enumerate(trials)}
-        results.sort(key=lambda each: place_of[each.trial])
-        axis = depth_tables.AXES[self.name]
-        rows = depth_tables.rows_of(results, axis)
-        header, cells = depth_tables.wide(rows, axis)
-        show_table([dict(zip(header, line, strict=True)) for line in cells])
-        save_text(run.out / "index.html", depth_tables.depth_page(self.name, results, place))
-        instances = [each.row() for each in results]
-        ratios = depth_tables.ratios(rows, axis)
-        evaluations = sum(each.evaluations for each in results)
-        run.finish({"rows": rows, "ratios": ratios, "instances": instances, **origin(), "evaluations": evaluations})
-
-    def _pose(self, run: Run) -> None:
-        """What an earlier run has done is taken from its `trials.json`."""
         if self.cameras < 1 or self.jobs < 1:
             raise ValueError(f"--cameras {self.cameras} and --jobs {self.jobs} were given; both must be at least 1")
         opened(self.model, run.device)
@@ -112,26 +114,44 @@ class Evaluate:
         save_text(run.out / "index.html", pose_table.pose_page(self.model, rows))
         run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in kept)})
 
-    def _shapes(self, run: Run) -> None:
-        opened_model, shapes = opened(self.model, run.device), read_split(self.split or self.model)
-        side = "train" if self.name == "training" else "test"
-        count = sum(shape.split == side for shape in shapes)
-        if self.name == "training":
-            results = training_results(opened_model, shapes, self.meshes, self.resolution)
-        elif self.name == "held-out":
-            results = held_out_results(opened_model, shapes, self.meshes, self.resolution)
-        else:
-            count *= len(METHODS)
-            results = completion_results(
-                opened_model, shapes, self.meshes, self.points, FitConfig(seed=self.seed), self.resolution
-            )
-        kept: list[Result] = []
-        with progress(self.name, count) as bar:
-            for result in results:
-                kept.append(result)
-                save_json(run.out / "rows.json", [done.row(self.model) for done in kept])
-                bar.advance(f"{result.shape}, {result.method}: {result.chamfer:.3f}")
-        _record(run, self.name, self.model, kept)
+
+Table = (
+    Annotated[Training, tyro.conf.subcommand("training")]
+    | Annotated[HeldOut, tyro.conf.subcommand("held-out")]
+    | Annotated[Completion, tyro.conf.subcommand("completion")]
+    | Annotated[SparseDepth, tyro.conf.subcommand("sparse-depth")]
+    | Annotated[Noise, tyro.conf.subcommand("noise")]
+    | Annotated[Focal, tyro.conf.subcommand("focal")]
+    | Annotated[Spread, tyro.conf.subcommand("spread")]
+    | Annotated[Pose, tyro.conf.subcommand("pose")]
+    | Annotated[Splits, tyro.conf.subcommand("splits")]
+    | Annotated[Choices, tyro.conf.subcommand("choices")]
+    | Annotated[Card, tyro.conf.subcommand("card")]
+)
+
+
+@dataclass(frozen=True)
+class Evaluate:
+    """Make a table of results."""
+
+    table: tyro.conf.OmitSubcommandPrefixes[Table]
+
+    def run(self) -> None:
+        self.table.run()
+
+
+def _count(shapes: list[Shape], side: str) -> int:
+    return sum(shape.split == side for shape in shapes)
+
+
+def _recorded(run: Run, name: str, model: str, results: Iterable[Result], count: int) -> None:
+    kept: list[Result] = []
+    with progress(name, count) as bar:
+        for result in results:
+            kept.append(result)
+            save_json(run.out / "rows.json", [done.row(model) for done in kept])
+            bar.advance(f"{result.shape}, {result.method}: {result.chamfer:.3f}")
+    _record(run, name, model, kept)
 
 
 def _record(run: Run, name: str, model: str, results: list[Result]) -> None:

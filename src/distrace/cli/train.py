@@ -1,5 +1,6 @@
 """`train`: from samples to a model, going on where it was stopped."""
 
+import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -10,7 +11,9 @@ import tyro
 from distrace.bench import poster_view
 from distrace.checkpoint import Model, save_experiment
 from distrace.cli.console import Run, console, progress, start
-from distrace.data.split import read_split
+from distrace.cli.data import sampled
+from distrace.data import sampling
+from distrace.data.split import every_mesh, has_meshes, read_split
 from distrace.decoder import NetworkSpecs
 from distrace.render import render
 from distrace.report import View
@@ -22,13 +25,14 @@ from distrace.train import train as run_training
 
 TRIED = 20  # steps that tell how many fit into --minutes
 PREVIEWED = 5
+MESH_SAMPLES = 200_000  # of each mesh that is not sampled yet
 
 
 @dataclass(frozen=True)
 class Train:
     """Train a DeepSDF decoder and the codes of its shapes. Run it again to go on after a stop."""
 
-    samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it
+    samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
     split: str | None = None  # learn only the training shapes of this split, and their variants
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
@@ -44,7 +48,8 @@ class Train:
     def run(self) -> None:
         torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers: training was 2.3 times slower
         run = start(self.out, self.device)
-        loaded = load_samples(_sample_files(self.samples, self.split)).to(run.device)
+        folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
+        loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
@@ -62,6 +67,18 @@ class Train:
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         loss = _run(run, loaded, training, config, self.save_every)
         run.finish({"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16})
+
+
+def _has_samples(folder: Path) -> bool:
+    return any(folder.glob("*.npz")) or not has_meshes(folder)
+
+
+def _sampled_meshes(meshes: Path, out: Path) -> Path:
+    """Every mesh below a folder sampled, with its mirror image and two warped copies."""
+    todo = sampling.jobs(every_mesh(meshes), meshes, out, MESH_SAMPLES, mirror=True, variants=2)
+    if not any(report.usable for report in sampled(todo, os.cpu_count() or 1)):
+        raise ValueError(f"no mesh in {meshes} bounds a solid; there is nothing to learn")
+    return out
 
 
 def _sample_files(folder: Path, split: str | None) -> list[Path]:

@@ -58,13 +58,15 @@ def load_solid(path: Path) -> Solid:
 
 
 def solid_of(shape: Shape, meshes: Path) -> Solid:
-    """A shape of a split as it is learnt; its mesh lies in a catalogue's folder, `meshes` or one below.
+    """A shape of a split as it is learnt. Raises `ValueError` where its mesh is missing, or as `load_solid` does."""
+    return turned(load_solid(mesh_of(shape, meshes)), shape.turn)
 
-    Raises `ValueError` where it is missing, or as `load_solid` does.
-    """
+
+def mesh_of(shape: Shape, meshes: Path) -> Path:
+    """Its file, in a catalogue's folder, `meshes` or one below. Raises `ValueError` where it is missing."""
     for path in (meshes / shape.path, *sorted(meshes.glob(f"*/{shape.path}"))):
         if path.is_file():
-            return turned(load_solid(path), shape.turn)
+            return path
     raise ValueError(f"{meshes / shape.path} is missing; `distrace data furniture` and `… planes` fetch the meshes")
 
 

@@ -1,6 +1,7 @@
 """Which shapes a model is trained on and which are held out, fixed in a file: `splits/sofas.csv`."""
 
 import csv
+from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
@@ -61,8 +62,16 @@ def every_mesh(folder: Path) -> list[Shape]:
 
     Raises `ValueError` where there is none.
     """
-    paths = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)
+    paths = sorted(path.relative_to(folder) for path in _meshes(folder))
     if not paths:
         raise ValueError(f"{folder} holds no mesh; files ending in {', '.join(MESH_SUFFIXES)} are looked for")
     names = ["-".join(path.with_suffix("").parts) for path in paths]
     return [Shape(name, "train", name, 0.0, str(path), "", "") for name, path in zip(names, paths)]
+
+
+def has_meshes(folder: Path) -> bool:
+    return next(_meshes(folder), None) is not None
+
+
+def _meshes(folder: Path) -> Iterator[Path]:
+    return (path for path in folder.rglob("*") if path.suffix.lower() in MESH_SUFFIXES)

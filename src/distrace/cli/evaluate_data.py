@@ -1,0 +1,73 @@
+"""Of `evaluate`: what models are trained on, and what they are like."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from distrace.card import pairs_picture, shapes_table, walks_picture
+from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.console import console, origin, progress, start
+from distrace.data.split import read_split
+from distrace.files import save_json, save_text
+from distrace.shading import save_png
+from distrace.split_table import nearest_rows, used
+from distrace.training_choices import choice_rows, choices
+
+
+@dataclass(frozen=True)
+class Splits:
+    """How near the held-out shapes of a split are to those trained on, and which shapes are near-variants."""
+
+    splits: tuple[str, ...] = ("sofas", "planes", "tables", "chairs")  # bundled ones, or CSV files
+    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    out: Path = Path("out/evaluate")
+
+    def run(self) -> None:
+        run, rows = start(self.out), []
+        for split in self.splits:
+            shapes = used(read_split(split))
+            with progress(split, len(shapes)) as bar:
+                nearest = nearest_rows(shapes, self.meshes, bar.advance)
+            rows += [{"class": split, **asdict(row)} for row in nearest]
+        show_table(rows)
+        run.finish({"rows": rows, **origin()})
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What a class is best learnt from: small networks trained on its shapes and on more and more variants of them."""
+
+    samples: Path = Path("out/samples")  # of the split, with `--mirror --variants 4`
+    split: str = "chairs"
+    meshes: Path = Path("out")
+    out: Path = Path("out/evaluate")
+    steps: int = 6000  # of each
+    resolution: int = 128  # of the meshes that are compared
+
+    def run(self) -> None:
+        run, rows = start(self.out), []
+        with progress("choices", len(choices())) as bar:
+            for row in choice_rows(self.samples, self.split, self.meshes, self.steps, self.resolution):
+                rows.append(asdict(row))
+                save_json(run.out / "rows.json", rows)
+                bar.advance(f"{row.choice}: {row.held_out_median:.2f}")
+        show_table(rows)
+        run.finish({"rows": rows, **origin()})
+
+
+@dataclass(frozen=True)
+class Card:
+    """For a model's card: pictures of each shape beside the truth and of walks between codes, and the table of shapes."""
+
+    model: ModelName = "sofas"
+    split: str | None = None  # by default that of the model's name
+    meshes: Path = Path("out")
+    out: Path = Path("out/evaluate")
+
+    def run(self) -> None:
+        run, shapes = start(self.out), read_split(self.split or self.model)
+        model = opened(self.model, run.device)
+        save_png(run.out / "walks.png", walks_picture(model, shapes))
+        save_png(run.out / "shapes.png", pairs_picture(model, shapes, self.meshes))
+        save_text(run.out / "shapes.md", shapes_table(shapes))
+        console.print(f"{len(model.codes)} codes of {len(shapes)} shapes")
+        run.finish({"codes": len(model.codes), **origin()})

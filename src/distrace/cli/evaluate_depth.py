@@ -1,0 +1,114 @@
+"""Of `evaluate`: the tables of completion from one view."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+from distrace import depth_tables
+from distrace.cli.common import show_table
+from distrace.cli.console import console, origin, progress, start
+from distrace.files import save_text
+from distrace.methods import METHODS
+from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, all_trials, done, held_out
+from distrace.spread_table import spread_rows
+from distrace.trials import each_done
+
+CLASSES = ("sofas", "planes", "tables", "chairs")
+
+
+@dataclass(frozen=True)
+class _DepthTable:
+    classes: tuple[str, ...] = CLASSES  # bundled splits, or CSV files
+    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
+    shapes: int | None = None  # held-out ones of each class; by default all
+    views: int = len(AZIMUTHS_ELEVATIONS)  # of each shape
+    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    out: Path = Path("out/evaluate")
+    resolution: int = 192  # of the meshes that are compared
+    jobs: int = 2  # processes
+
+    def _run(self, name: str) -> None:
+        """Each trial leaves a file in `trials`; what is there already is not done again."""
+        if self.jobs < 1 or not 1 <= self.views <= len(AZIMUTHS_ELEVATIONS) or (self.shapes or 1) < 1:
+            given = f"--jobs {self.jobs} --views {self.views} --shapes {self.shapes}"
+            raise ValueError(f"{given} was given; at least 1 of each are needed, and at most 4 views")
+        run, models = start(self.out), paired(self.classes, self.models)
+        place = Place(self.meshes, run.out, models, self.resolution)
+        trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
+        results: list[Done] = []
+        with progress(name, len(trials)) as bar:
+            for each in each_done(partial(done, place), trials, self.jobs):
+                results.append(each)
+                bar.advance(f"{each.trial.shape}, {each.trial.method}: {each.chamfer:.2f}")
+        order = {trial: number for number, trial in enumerate(trials)}
+        results.sort(key=lambda each: order[each.trial])
+        rows = depth_tables.rows_of(results, depth_tables.AXES[name])
+        header, cells = depth_tables.wide(rows, depth_tables.AXES[name])
+        show_table([dict(zip(header, line, strict=True)) for line in cells])
+        save_text(run.out / "index.html", depth_tables.depth_page(name, results, place))
+        facts = {
+            "rows": rows,
+            "ratios": depth_tables.ratios(rows, depth_tables.AXES[name]),
+            "instances": [each.row() for each in results],
+            "evaluations": sum(each.evaluations for each in results),
+        }
+        run.finish({**facts, **origin()})
+
+
+@dataclass(frozen=True)
+class SparseDepth(_DepthTable):
+    """The published table: held-out shapes completed from ever fewer depths of one view. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("sparse-depth")
+
+
+@dataclass(frozen=True)
+class Noise(_DepthTable):
+    """The same from a tenth of the depths, disturbed: noise, steps, outliers, holes. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("noise")
+
+
+@dataclass(frozen=True)
+class Focal(_DepthTable):
+    """The same from a tenth of the depths, seen at other focal lengths. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("focal")
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Whether several completions are apart where one of them is wrong."""
+
+    classes: tuple[str, ...] = CLASSES
+    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    meshes: Path = Path("out")
+    out: Path = Path("out/evaluate")
+    jobs: int = 2  # processes
+
+    def run(self) -> None:
+        run, rows = start(self.out), []
+        with progress("spread", sum(len(held_out(category)) for category in self.classes)) as bar:
+            for category, model in paired(self.classes, self.models):
+                for row in spread_rows(category, model, self.meshes, self.jobs):
+                    rows.append(asdict(row))
+                    bar.advance(f"{row.shape}: {row.correlation:.2f}")
+        show_table(rows)
+        middle = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
+        console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in middle.items()))
+        run.finish({"rows": rows, "median_correlation": middle, **origin()})
+
+
+def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Each class with its model. Raises `ValueError` for more or fewer of them."""
+    models = models or classes
+    if len(models) != len(classes):
+        given = f"{len(models)} models ({', '.join(models)}) were given"
+        raise ValueError(f"{given} for {len(classes)} classes ({', '.join(classes)}); give one each")
+    return tuple(zip(classes, models, strict=True))

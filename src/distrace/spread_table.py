@@ -1,0 +1,70 @@
+"""Whether completions that differ say where they are wrong: the spread of several against the error of one."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import igl
+import numpy as np
+import torch
+from scipy.stats import rankdata
+
+from distrace.checkpoint import load_model
+from distrace.data.solid import solid_of
+from distrace.data.split import read_split
+from distrace.data.view import observe
+from distrace.fit_code import CodeFitConfig
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.methods import completing
+from distrace.metrics import chamfer, surface_points
+from distrace.plausible import plausible, spread
+from distrace.sparse_depth import camera_of, hash_of
+from distrace.trials import each_done
+
+COMPLETIONS = 6  # whose spread is taken
+POINTS = 100  # observed depths, besides the silhouette
+LOOKED_AT = 5000  # points of the completed surface
+
+
+@dataclass(frozen=True)
+class SpreadRow:
+    """A held-out shape seen once: the rank correlation of spread and error over its completed surface."""
+
+    category: str
+    shape: str
+    correlation: float
+    error_calm: float  # mean distance to the true surface of the half of it where completions agree best …
+    error_apart: float  # … and of the other half
+    chamfer: float
+    seconds: float  # of all completions
+
+
+def spread_rows(category: str, model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
+    """Each held-out shape of a split."""
+    names = [shape.name for shape in read_split(category) if shape.split == "test"]
+    return each_done(partial(_row, category, model, meshes), names, jobs)
+
+
+def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
+    opened = load_model(model)
+    (shape,) = (shape for shape in read_split(category) if shape.name == name)
+    truth, seed = solid_of(shape, meshes), hash_of(name)
+    view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
+    steps = list(completing(opened, view, CodeFitConfig()))
+    others = list(plausible(opened, view, COMPLETIONS, seed=seed))
+    mesh = extract_mesh(opened.field(steps[-1].code), MeshConfig())
+    points = surface_points(mesh, LOOKED_AT, seed=0)
+    apart = spread(opened, [step.code for step in others], torch.tensor(points, dtype=torch.float32)).numpy()
+    surface = truth.surface
+    squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces.astype(np.int64))
+    error, calm = np.sqrt(squared), apart < np.median(apart)
+    return SpreadRow(
+        category,
+        name,
+        float(np.corrcoef(rankdata(apart), rankdata(error))[0, 1]),
+        float(error[calm].mean()),
+        float(error[~calm].mean()),
+        chamfer(mesh, surface).sum,
+        sum(step.seconds for step in (*steps, *others)),
+    )
