@@ -14,7 +14,9 @@ from PIL import Image
 from test_train import SPECS, of_sphere, spheres
 
 import distrace.cli
+import distrace.cli.train
 import distrace.movie
+from distrace import training_choices
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.data.samples import write_samples
@@ -213,6 +215,114 @@ def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path
     assert "<html" in (out / "report.html").read_text(encoding="utf-8")[:500]
 
 
+def test_complete_takes_points_and_says_what_else_would_fit(model: Path, run: Command, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+    ball.update_faces(ball.triangles_center[:, 2] > 0)
+    ball.remove_unreferenced_vertices()
+    ball.export(tmp_path / "half.ply")
+    run("complete", model, tmp_path / "half.ply", "--plausible", 2, "--resolution", 16, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+    others = {"plausible-1.ply", "plausible-2.ply"}
+    assert names(out) == {"result.json", "mesh.ply", "code.npy", "report.html", "shaded.png", *others}
+    mesh = trimesh.load(out / "mesh.ply", process=False)
+    assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.6).mean() < 0.05
+    spread = mesh.metadata["_ply_raw"]["vertex"]["data"]["spread"]
+    assert spread.shape == (len(mesh.vertices),)
+    assert (spread >= 0).all()
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "A shape completed from points" in page
+    assert "Other shapes that fit" in page
+
+
+def test_train_samples_a_folder_of_meshes_first(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "mine").mkdir()
+    trimesh.creation.box((1, 2, 3)).export(tmp_path / "mine" / "box.ply")
+    monkeypatch.setattr(distrace.cli.train, "MESH_SAMPLES", 2000)
+    monkeypatch.setattr(distrace.cli.train.os, "cpu_count", lambda: 1)
+    size = ("--layers", 2, "--width", 16, "--code-length", 4)
+    run("train", tmp_path / "mine", "--steps", 3, *size, "--out", tmp_path / "model")
+    assert load_model(tmp_path / "model").shapes == ("box", "box~warped1", "box~warped2")
+    run("train", tmp_path / "mine", "--steps", 5, "--out", tmp_path / "model")
+    assert result(tmp_path / "model")["steps"] == 5, "a longer run goes on from where the shorter one ended"
+
+
+@pytest.fixture(scope="module")
+def spheres_split(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Balls: two that the model knows, one held out and one left out; and the folder of their meshes."""
+    folder = tmp_path_factory.mktemp("balls")
+    lines = ["name,split,design,turn,path,creator,licence,note"]
+    for name, split, note in (
+        ("sphere0", "train", ""),
+        ("sphere1", "train", ""),
+        ("held", "test", ""),
+        ("flat", "out", "it is flat"),
+    ):
+        trimesh.creation.icosphere(subdivisions=2).export(folder / f"{name}.ply")
+        lines.append(f"{name},{split},{name},0,{name}.ply,me,CC0-1.0,{note}")
+    (folder / "balls.csv").write_text("\n".join(lines) + "\n")
+    return folder / "balls.csv", folder
+
+
+def test_evaluate_held_out_tells_a_model_all_distances(
+    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+) -> None:
+    split, meshes = spheres_split
+    run("evaluate", "held-out", "--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path)
+    (row,) = result(tmp_path, "rows", "summary")["rows"]
+    assert (row["shape"], row["method"]) == ("held", "all distances")
+
+
+def test_evaluate_sparse_depth_writes_a_table_and_goes_on(
+    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+) -> None:
+    split, meshes = spheres_split
+    where = ("--classes", split, "--models", model, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
+    run("evaluate", "sparse-depth", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    facts = result(tmp_path, "rows", "ratios", "instances", "evaluations")
+    assert [row["density"] for row in facts["rows"]] == ["dense", "50%", "10%", "100", "50", "20"]
+    assert len(facts["instances"]) == 6
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")}
+    run("evaluate", "sparse-depth", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")} == before
+
+
+def test_evaluate_spread_correlates_spread_and_error(
+    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+) -> None:
+    split, meshes = spheres_split
+    run("evaluate", "spread", "--classes", split, "--models", model, "--meshes", meshes, "--jobs", 1, "--out", tmp_path)
+    (row,) = result(tmp_path, "rows", "median_correlation")["rows"]
+    assert -1 <= row["correlation"] <= 1
+
+
+def test_evaluate_splits_and_card_describe_what_a_model_was_trained_on(
+    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+) -> None:
+    split, meshes = spheres_split
+    run("evaluate", "splits", "--splits", split, "--meshes", meshes, "--out", tmp_path / "splits")
+    rows = result(tmp_path / "splits", "rows")["rows"]
+    assert {row["shape"] for row in rows} == {"sphere0", "sphere1", "held"}
+    assert all(row["chamfer"] < 5 for row in rows), "they are one shape"
+    run("evaluate", "card", "--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path / "card")
+    assert names(tmp_path / "card") == {"result.json", "walks.png", "shapes.png", "shapes.md"}
+    said = (tmp_path / "card" / "shapes.md").read_text(encoding="utf-8")
+    assert "| flat | left out: it is flat | me | CC0-1.0 |" in said
+    assert "| held | held out | me | CC0-1.0 |" in said
+
+
+def test_evaluate_choices_trains_small_networks(
+    spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    split, meshes = spheres_split
+    run("sample", meshes, "--split", split, "--variants", 1, "--count", 1500, "--workers", 1, "--out", tmp_path / "s")
+    monkeypatch.setattr(training_choices, "SPECS", SPECS)
+    where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
+    run("evaluate", "choices", *where, "--steps", 60, "--resolution", 24)
+    rows = result(tmp_path / "out", "rows")["rows"]
+    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4]
+    assert all(row["held_out_median"] > 0 for row in rows)
+
+
 def test_complete_in_a_few_iterations_still_ends_with_a_code(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:
@@ -345,6 +455,8 @@ BAD = [
     ("bench trace {tmp}/missing", "neither a folder nor a bundled model"),
     ("complete {model} {tmp}/missing.npz", "missing.npz is not an observation"),
     ("complete {model} {tmp}/text", "text is not an observation"),
+    ("complete {model} {tmp}/missing.ply", "missing.ply cannot be read as a cloud of points"),
+    ("complete {model} {view} --plausible -1", "--plausible -1"),
     ("complete {model} {tmp}/empty", "empty is not an observation"),
     ("complete {model} {tmp}", "is not an observation"),
     ("complete {model} {view} --points 0", "--points 0"),
@@ -363,11 +475,19 @@ BAD = [
     ("pose {model} {view} --starts 0", "0 starts"),
     ("pose {model} {view} --azimuth 0 --distance 0", "its own place"),
     ("evaluate pose --model {model} --cameras 0", "--cameras 0"),
-    ("evaluate training --model {model} --meshes {tmp}/missing", "no shape in common"),
-    ("evaluate completion --model {model} --meshes {tmp}/missing", "is missing; `distrace data furniture"),
+    ("evaluate training --model {model} --split sofas --meshes {tmp}/missing", "no shape in common"),
+    ("evaluate training --model {model}", "there is no split"),
+    ("evaluate completion --model {model} --split sofas --meshes {tmp}/missing", "is missing; `distrace data furniture"),
     ("evaluate completion --model {model} --split {tmp}/text", "lacks the columns"),
     ("evaluate completion --model {model} --split {tmp}/missing", "there is no split"),
     ("evaluate fame --model {model}", "fame"),
+    ("evaluate sparse-depth --views 5", "--views 5"),
+    ("evaluate noise --models {model}", "1 models"),
+    ("evaluate sparse-depth --classes {tmp}/missing", "there is no split"),
+    ("evaluate splits --splits {tmp}/missing", "there is no split"),
+    ("evaluate splits --meshes {tmp}/missing", "is missing; `distrace data furniture"),
+    ("evaluate card --model {tmp}/missing --split sofas", "neither a folder nor a bundled model"),
+    ("evaluate choices --samples {tmp}/missing", "holds no samples of chairs"),
     ("data furniture --from {tmp}/text", "text"),
     ("data furniture --from {tmp}/missing", "missing"),
     ("data chairs", "chairs"),

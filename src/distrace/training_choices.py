@@ -1,6 +1,6 @@
 """What a class is best learnt from: small networks trained on its shapes and on more and more variants of them."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import mean, median
@@ -39,22 +39,23 @@ class ChoiceRow:
     held_out_mean: float
 
 
-def choices() -> list[Choice]:
-    return [
-        Choice("the shapes alone", lambda variant: not variant),
-        Choice("and mirrored", lambda variant: not variant.startswith("warped")),
-        Choice("and warped twice", lambda variant: variant not in ("warped3", "warped4")),
-        Choice("and warped four times", lambda variant: True),
-        Choice("… drawn as often as shapes", lambda variant: True, TrainConfig(variant_weight=1.0)),
-        Choice("… codes held ten times tighter", lambda variant: True, TrainConfig(code_penalty=1e-3)),
-    ]
+CHOICES = [
+    Choice("the shapes alone", lambda variant: not variant),
+    Choice("and mirrored", lambda variant: not variant.startswith("warped")),
+    Choice("and warped twice", lambda variant: variant not in ("warped3", "warped4")),
+    Choice("and warped four times", lambda variant: True),
+    Choice("… variants drawn as often as shapes", lambda variant: True, TrainConfig(variant_weight=1.0)),
+    Choice("… codes held ten times tighter", lambda variant: True, TrainConfig(code_penalty=1e-3)),
+]
 
 
-def choice_rows(samples: Path, split: str, meshes: Path, steps: int, resolution: int) -> Iterator[ChoiceRow]:
+def choice_rows(
+    samples: Path, split: str, meshes: Path, steps: int, resolution: int, choices: Sequence[Choice] = CHOICES
+) -> Iterator[ChoiceRow]:
     """Each choice with as many steps. Raises `ValueError` for missing samples or meshes."""
     shapes = read_split(split)
     learnt = [shape.name for shape in shapes if shape.split == "train"]
-    for choice in choices():
+    for choice in choices:
         paths = [
             path
             for name in learnt

@@ -10,7 +10,7 @@ from distrace.data.split import read_split
 from distrace.files import save_json, save_text
 from distrace.shading import save_png
 from distrace.split_table import nearest_rows, used
-from distrace.training_choices import choice_rows, choices
+from distrace.training_choices import CHOICES, choice_rows
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Choices:
 
     def run(self) -> None:
         run, rows = start(self.out), []
-        with progress("choices", len(choices())) as bar:
+        with progress("choices", len(CHOICES)) as bar:
             for row in choice_rows(self.samples, self.split, self.meshes, self.steps, self.resolution):
                 rows.append(asdict(row))
                 save_json(run.out / "rows.json", rows)
@@ -56,7 +56,7 @@ class Choices:
 
 @dataclass(frozen=True)
 class Card:
-    """For a model's card: pictures of each shape beside the truth and of walks between codes, and the table of shapes."""
+    """For a card: pictures of each shape beside the truth and of walks between codes, and the table of shapes."""
 
     model: ModelName = "sofas"
     split: str | None = None  # by default that of the model's name
