@@ -19,6 +19,8 @@ from distrace.trace import TraceConfig, sphere_trace
 
 BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
+WATCHED = 0.075  # … and those that come closer than this are looked at after each step, …
+WINDOW = 0.1  # … so far before and behind where they came closest; the others when a stage begins
 REACH, ROUNDS = 0.05, 2  # … to two thousandths
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
@@ -27,11 +29,10 @@ PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
 
 @dataclass(frozen=True)
 class Comparison:
-    """What deviations count: as in Adam's loss, rounded off below `scale`."""
+    """What deviations count: as in Adam's loss."""
 
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
-    scale: float = 0.02
     trace: TraceConfig = field(
         default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
     )
@@ -64,8 +65,9 @@ class Seen:
     def known(self) -> Bool[Tensor, "n"]:
         return self.observed.isfinite()
 
-    def some(self, which: Tensor) -> tuple[Rays, Bounds]:
-        return self.rays[which], Bounds(self.bounds.near[which], self.bounds.far[which])
+    def __getitem__(self, rows: Tensor) -> "Seen":
+        bounds = Bounds(self.bounds.near[rows], self.bounds.far[rows])
+        return Seen(self.rays[rows], bounds, self.observed[rows], self.is_object[rows], self.weights[rows])
 
 
 @dataclass(frozen=True)
@@ -76,6 +78,7 @@ class Look:
     distance: Float[Tensor, "n"]
     hit: Bool[Tensor, "n"]
     compared: Bool[Tensor, "n"]
+    watched: Bool[Tensor, "n"]  # compared, or near to that: what a step may change
 
 
 @dataclass
@@ -86,35 +89,50 @@ class Problem:
     prior: Prior
     seen: Seen
     config: Comparison
+    scale: float = 0.02  # up to which deviations count by their squares
     evaluations: int = 0
-
-    @property
-    def scale(self) -> float:
-        return self.config.scale
 
     @torch.no_grad()
     def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
-        """Rays are followed from where they ended last; those with a depth no farther than that.
+        """Along all rays; those that ended on the surface last are followed from there on."""
+        near, far = self.seen.bounds.near, self.seen.bounds.far
+        if last is not None:
+            near = torch.where(last.hit | self.seen.known, last.distance - BACK, near)
+        return self._look(w, self.seen, Bounds(near, far))
 
-        Of the others those that disagree with the mask are compared, where the field is least.
+    @torch.no_grad()
+    def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
+        """Along the rays that are watched, about where they ended last; the others stay as they were."""
+        rows = look.watched.nonzero()[:, 0]
+        seen, t, known = self.seen[rows], look.distance[rows], self.seen.known[rows]
+        near = (t - torch.where(known | look.hit[rows], BACK, WINDOW)).maximum(seen.bounds.near)
+        part = self._look(look.w + step, seen, Bounds(near, (t + WINDOW).minimum(seen.bounds.far)))
+        whole = (look.distance.clone(), look.hit.clone(), look.compared.clone())
+        for image, new in zip(whole, (part.distance, part.hit, part.compared), strict=True):
+            image[rows] = new
+        return Look(part.w, *whole, look.watched)
+
+    def _look(self, w: Float[Tensor, "dimensions"], seen: Seen, within: Bounds) -> Look:
+        """Rays with a depth are followed no farther than that.
+
+        Of the others those that disagree with the mask are compared, where the field is least; those that are near to
+        that are watched.
         """
-        seen, sdf = self.seen, Counted(self.decoder.field(self.prior.code(w)))
-        known, bounds = seen.known, Bounds(seen.bounds.near, seen.bounds.far.minimum(seen.observed))
-        begin = None if last is None else torch.where(last.hit | known, last.distance - BACK, bounds.near)
-        trace = sphere_trace(sdf, seen.rays, bounds, self.config.trace, begin)
+        sdf, known = Counted(self.decoder.field(self.prior.code(w))), seen.known
+        far = torch.where(known, seen.observed.minimum(seen.bounds.far), within.far)
+        trace = sphere_trace(sdf, seen.rays, Bounds(seen.bounds.near, far), self.config.trace, within.near)
         t = torch.where(trace.hit | ~known, trace.closest, seen.observed)
         free = ~known & ~seen.is_object & seen.bounds.meets
         aside = (free & ~trace.hit).nonzero()[:, 0]
-        free[aside] = sdf(seen.rays[aside].at(t[aside])) < ATTENTION
+        values = sdf(seen.rays[aside].at(t[aside]))
+        close = free.clone()
+        free[aside], close[aside] = values < ATTENTION, values < WATCHED
         lacking = ~known & seen.is_object & seen.bounds.meets & ~trace.hit
         wrong = free | lacking
-        rays, limits = seen.some(wrong)
-        t[wrong] = minimum(sdf, rays, t[wrong], limits, reach=REACH, refine=ROUNDS)
+        some = seen[wrong]
+        t[wrong] = minimum(sdf, some.rays, t[wrong], some.bounds, reach=REACH, refine=ROUNDS)
         self.evaluations += sdf.evaluations
-        return Look(w, t, trace.hit, known | wrong)
-
-    def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
-        return self.look(look.w + step, look)
+        return Look(w, t, trace.hit, known | wrong, known | close | lacking)
 
     def residuals(self, look: Look) -> Residuals:
         """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
@@ -133,7 +151,7 @@ class Problem:
         along = torch.where(known, 1 / slope.clamp_min(GRAZING), 1.0)
         values = torch.where(known, values + before * slope, lacking) * along
         jacobian = (by_code @ self.prior.basis * along[:, None]).masked_fill((values == 0)[:, None], 0.0)
-        weights = seen.weights[rows] / self.config.scale
+        weights = seen.weights[rows] / self.scale
         return with_prior(values, jacobian, weights, look.w, self.config.weights.code)
 
     def terms(self, look: Look, residuals: Residuals) -> dict[str, float]:

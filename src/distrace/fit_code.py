@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
@@ -22,16 +22,16 @@ from distrace.starts import Starts, Step, best_of
 
 @dataclass(frozen=True)
 class CodeFitConfig(Starts):
-    """Steps in stages, each with rays of its own and a smaller scale beyond which residuals count less."""
+    """Steps in stages. Each begins with a look along all rays; deviations beyond an ever smaller scale count less."""
 
     iterations: int = 24
     trial: int = 3
     stages: int = 8
-    depth_rays: int = 1000  # of each view in each stage
+    depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
-    first_share: float = 0.3  # of them, in the first stage; from the middle on all
     compared: Comparison = Comparison()
-    narrowing: float = 0.65  # of the scale, from one stage to the next: at first what is far off is no outlier
+    scale: float = 0.02  # at first: what is far off is no outlier …
+    narrowing: float = 0.65  # … and × this from one stage to the next
     damping: float = 0.1
 
     def __post_init__(self) -> None:
@@ -44,13 +44,6 @@ class CodeFitConfig(Starts):
         ends = [self.iterations * stage // self.stages for stage in range(self.stages + 1)]
         return [end - begin for begin, end in pairwise(ends) if end > begin]
 
-    def share_at(self, stage: int) -> float:
-        """Of the rays of the silhouette: while all is coarse, a part of them is enough."""
-        return min(1.0, self.first_share + (1 - self.first_share) * stage / max(self.stages // 2, 1))
-
-    def compared_at(self, stage: int) -> Comparison:
-        return replace(self.compared, scale=self.compared.scale * self.narrowing**stage)
-
 
 def fit_code(
     decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
@@ -61,10 +54,9 @@ def fit_code(
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
 
-    def problem(stage: int, random: torch.Generator) -> Problem:
-        compared, mask_rays = config.compared_at(stage), round(config.mask_rays * config.share_at(stage))
-        targets = [pool.draw(config.depth_rays, mask_rays, random) for pool in pools]
-        return Problem(decoder, prior, Seen.of(targets, compared.weights), compared)
+    def problem(random: torch.Generator) -> Problem:
+        targets = [pool.draw(config.depth_rays, config.mask_rays, random) for pool in pools]
+        return Problem(decoder, prior, Seen.of(targets, config.compared.weights), config.compared)
 
     return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
 
@@ -79,30 +71,28 @@ def fit_points(
     if not len(samples):
         raise ValueError("no points were given; fitting needs points with their signed distances")
 
-    def problem(stage: int, random: torch.Generator) -> PointProblem:
+    def problem(random: torch.Generator) -> PointProblem:
         chosen = samples[torch.randperm(len(samples), generator=random)[: config.depth_rays + config.mask_rays]]
-        compared = config.compared_at(stage)
-        return PointProblem(decoder, prior, chosen, compared.weights.depth, compared.weights.code, compared.scale)
+        return PointProblem(decoder, prior, chosen, config.compared.weights)
 
     return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
 
 
 def _solved(
-    problem_of: Callable[[int, torch.Generator], Problem | PointProblem],
-    prior: Prior,
-    config: CodeFitConfig,
-    start: int,
+    problem_of: Callable[[torch.Generator], Problem | PointProblem], prior: Prior, config: CodeFitConfig, start: int
 ) -> Iterator[Step]:
     """From one start, on the same rays or points as from the others."""
     began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
-    random, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
+    problem: Any = problem_of(torch.Generator().manual_seed(config.seed))
+    state = None
     for stage, length in enumerate(config.stage_lengths):
-        problem: Any = problem_of(stage, random)
+        problem.scale = config.scale * config.narrowing**stage
+        state = problem.look(prior.start(start, config.seed)) if state is None else problem.look(state.w, state)
         solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=charbonnier, settled=0.0)
-        for solution in minimise(problem.residuals, problem.look(w), problem.moved, solver):
-            w, damping, done = solution.state.w, solution.damping, done + 1
-            terms = problem.terms(solution.state, solution.residuals)
-            seconds, evaluations, before = time.perf_counter() - began, problem.evaluations, evaluations
-            yield Step(start, done, sum(terms.values()), terms, prior.code(w), seconds, evaluations - before)
+        for solution in minimise(problem.residuals, state, problem.moved, solver):
+            state, damping, done = solution.state, solution.damping, done + 1
+            terms = problem.terms(state, solution.residuals)
+            seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
+            code = prior.code(state.w)
+            yield Step(start, done, sum(terms.values()), terms, code, seconds, evaluations - before)
             began = time.perf_counter()
-        evaluations = 0

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from distrace.code_residuals import derivatives, with_prior
 from distrace.decoder import Decoder
+from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.solver import Residuals
 
@@ -28,12 +29,11 @@ class PointProblem:
     decoder: Decoder
     prior: Prior
     samples: Float[Tensor, "n 4"]
-    weight: float  # of the mean deviation
-    code_weight: float  # of the mean squared coordinate
-    scale: float
+    counted: Weights
+    scale: float = 0.02  # up to which deviations count by their squares
     evaluations: int = 0
 
-    def look(self, w: Float[Tensor, "dimensions"]) -> Coordinates:
+    def look(self, w: Float[Tensor, "dimensions"], last: Coordinates | None = None) -> Coordinates:
         return Coordinates(w)
 
     def moved(self, at: Coordinates, step: Float[Tensor, "dimensions"]) -> Coordinates:
@@ -46,9 +46,12 @@ class PointProblem:
         far = (values.abs() > CLAMP) & (distances.abs() > CLAMP) & (values.sign() == distances.sign())
         lacking = (values - distances).masked_fill(far, 0.0)
         jacobian = (by_code @ self.prior.basis).masked_fill(far[:, None], 0.0)
-        weights = torch.full_like(lacking, self.weight / len(lacking) / self.scale)
-        return with_prior(lacking, jacobian, weights, w, self.code_weight)
+        weights = torch.full_like(lacking, self.counted.depth / len(lacking) / self.scale)
+        return with_prior(lacking, jacobian, weights, w, self.counted.code)
 
     def terms(self, at: Coordinates, residuals: Residuals) -> dict[str, float]:
         distance = residuals.values[: len(self.samples)].abs().mean()
-        return {"distance": self.weight * float(distance), "code": self.code_weight * float(at.w.square().mean())}
+        return {
+            "distance": self.counted.depth * float(distance),
+            "code": self.counted.code * float(at.w.square().mean()),
+        }
