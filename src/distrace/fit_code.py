@@ -29,6 +29,7 @@ class CodeFitConfig(Starts):
     stages: int = 8
     depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
+    first_share: float = 0.3  # of them, in the first stage: while all is coarse, and starts compete
     compared: Comparison = Comparison()
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.65  # … and × this from one stage to the next
@@ -54,8 +55,8 @@ def fit_code(
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
 
-    def problem(random: torch.Generator) -> Problem:
-        targets = [pool.draw(config.depth_rays, config.mask_rays, random) for pool in pools]
+    def problem(random: torch.Generator, share: float) -> Problem:
+        targets = [pool.draw(config.depth_rays, round(config.mask_rays * share), random) for pool in pools]
         return Problem(decoder, prior, Seen.of(targets, config.compared.weights), config.compared)
 
     return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
@@ -71,28 +72,36 @@ def fit_points(
     if not len(samples):
         raise ValueError("no points were given; fitting needs points with their signed distances")
 
-    def problem(random: torch.Generator) -> PointProblem:
-        chosen = samples[torch.randperm(len(samples), generator=random)[: config.depth_rays + config.mask_rays]]
+    def problem(random: torch.Generator, share: float) -> PointProblem:
+        chosen = samples[
+            torch.randperm(len(samples), generator=random)[: config.depth_rays + round(config.mask_rays * share)]
+        ]
         return PointProblem(decoder, prior, chosen, config.compared.weights)
 
     return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
 
 
 def _solved(
-    problem_of: Callable[[torch.Generator], Problem | PointProblem], prior: Prior, config: CodeFitConfig, start: int
+    problem_of: Callable[[torch.Generator, float], Problem | PointProblem],
+    prior: Prior,
+    config: CodeFitConfig,
+    start: int,
 ) -> Iterator[Step]:
     """From one start, on the same rays or points as from the others."""
     began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
-    problem: Any = problem_of(torch.Generator().manual_seed(config.seed))
+    random, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
+    problem: Any = None
     state = None
     for stage, length in enumerate(config.stage_lengths):
+        if stage < 2:
+            problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
         problem.scale = config.scale * config.narrowing**stage
-        state = problem.look(prior.start(start, config.seed)) if state is None else problem.look(state.w, state)
+        state = problem.look(w, state)
         solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=charbonnier, settled=0.0)
         for solution in minimise(problem.residuals, state, problem.moved, solver):
             state, damping, done = solution.state, solution.damping, done + 1
             terms = problem.terms(state, solution.residuals)
             seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
-            code = prior.code(state.w)
-            yield Step(start, done, sum(terms.values()), terms, code, seconds, evaluations - before)
+            w = state.w
+            yield Step(start, done, sum(terms.values()), terms, prior.code(w), seconds, evaluations - before)
             began = time.perf_counter()
