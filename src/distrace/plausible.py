@@ -19,7 +19,7 @@ from distrace.methods import completing
 from distrace.prior import DEVIATION, Prior, prior_of
 from distrace.starts import Step
 
-CONFIG = CodeFitConfig(iterations=12, starts=1, stages=4, narrowing=0.42)
+CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3)
 FAR = 0.1  # decoders say no more of distances beyond
 
 

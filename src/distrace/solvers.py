@@ -11,6 +11,7 @@ from torch import Tensor
 
 from distrace.bench import poster_view
 from distrace.checkpoint import Model
+from distrace.code_residuals import Comparison
 from distrace.data.solid import solid_of
 from distrace.data.split import Shape
 from distrace.data.view import View, observe
@@ -24,7 +25,7 @@ from distrace.starts import Step
 from distrace.targets import Pool
 
 ADAM = FitConfig(iterations=200, starts=1)
-SOLVER = CodeFitConfig(starts=1)
+SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, compared=Comparison())  # Adam's own loss, far down
 POINTS = (100,)  # observed depths; 0: all of them
 RAYS = 1000  # with a depth, and as many of the silhouette, on which the loss of every curve is measured
 RESOLUTION = 128  # of the meshes that are compared

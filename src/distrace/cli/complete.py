@@ -34,7 +34,7 @@ class Complete:
     points: int | None = None  # use only so many of the depths or points, drawn at random
     ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
     solver: Literal["adam", "lm"] = "adam"  # lm: Levenberg–Marquardt, in a fraction of the time; points have no other
-    iterations: int | None = None  # by default 150 of Adam, or 24 of Levenberg–Marquardt
+    iterations: int | None = None  # by default 150 of Adam, or 16 of Levenberg–Marquardt
     starts: int = FitConfig.starts
     plausible: int = 0  # so many other completions that fit, too, and how far they are apart
     seed: int = 0
