@@ -31,7 +31,7 @@ class CodeFitConfig(Starts):
     depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
     first_share: float = 0.3  # of them, in the first stage: while all is coarse, and starts compete
-    compared: Comparison = Comparison(Weights(code=0.2))  # the prior weighs more than Adam's: docs/from_the_paper.md
+    compared: Comparison = Comparison(Weights(code=0.05))  # the prior weighs more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.42  # … and × this from one stage to the next
     damping: float = 0.1
