@@ -286,6 +286,18 @@ def test_evaluate_sparse_depth_writes_a_table_and_goes_on(
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")} == before
 
 
+def test_evaluate_focal_also_looks_at_what_was_fitted_through_other_focal_lengths(
+    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+) -> None:
+    split, meshes = spheres_split
+    where = ("--classes", split, "--models", model, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
+    run("evaluate", "focal", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    facts = result(tmp_path, "rows", "tests")
+    assert [row["focal_ratio"] for row in facts["rows"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
+    assert [row["tested_at"] for row in facts["tests"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
+    assert all(0 < row["iou_median"] <= 1 and row["depth_error_median"] < 0.5 for row in facts["tests"])
+
+
 def test_evaluate_spread_correlates_spread_and_error(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
 ) -> None:
@@ -477,7 +489,10 @@ BAD = [
     ("evaluate pose --model {model} --cameras 0", "--cameras 0"),
     ("evaluate training --model {model} --split sofas --meshes {tmp}/missing", "no shape in common"),
     ("evaluate training --model {model}", "there is no split"),
-    ("evaluate completion --model {model} --split sofas --meshes {tmp}/missing", "is missing; `distrace data furniture"),
+    (
+        "evaluate completion --model {model} --split sofas --meshes {tmp}/missing",
+        "is missing; `distrace data furniture",
+    ),
     ("evaluate completion --model {model} --split {tmp}/text", "lacks the columns"),
     ("evaluate completion --model {model} --split {tmp}/missing", "there is no split"),
     ("evaluate fame --model {model}", "fame"),

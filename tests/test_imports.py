@@ -44,6 +44,7 @@ ORDER = [
         "training_choices",
         "trials",
         "sparse_depth",
+        "focal_test",
         "split_table",
         "spread_table",
         "page",

@@ -39,7 +39,10 @@ def main() -> None:
     try:
         _run(sys.argv[1:])
     except KeyboardInterrupt:
-        _end("stopped; files written so far are whole, and train, sample and most tables of evaluate go on from there", 130)
+        _end(
+            "stopped; what is written is whole, and train, sample and most tables of evaluate go on from there",
+            130,
+        )
     except (ValueError, OSError) as error:
         _end(str(error), 2)
     except (MemoryError, RuntimeError) as error:

@@ -1,6 +1,6 @@
 """Of `evaluate`: the tables of completion from one view."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,8 +10,9 @@ from distrace import depth_tables
 from distrace.cli.common import show_table
 from distrace.cli.console import console, origin, progress, start
 from distrace.files import save_text
+from distrace.focal_test import look_rows, looks
 from distrace.methods import METHODS
-from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, all_trials, done, held_out
+from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
 from distrace.spread_table import spread_rows
 from distrace.trials import each_done
 
@@ -30,8 +31,8 @@ class _DepthTable:
     resolution: int = 192  # of the meshes that are compared
     jobs: int = 2  # processes
 
-    def _run(self, name: str) -> None:
-        """Each trial leaves a file in `trials`; what is there already is not done again."""
+    def _run(self, name: str, more: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
+        """Each trial leaves a file in `trials`; what is there already is not done again. `more` facts may follow."""
         if self.jobs < 1 or not 1 <= self.views <= len(AZIMUTHS_ELEVATIONS) or (self.shapes or 1) < 1:
             given = f"--jobs {self.jobs} --views {self.views} --shapes {self.shapes}"
             raise ValueError(f"{given} was given; at least 1 of each are needed, and at most 4 views")
@@ -55,7 +56,7 @@ class _DepthTable:
             "instances": [each.row() for each in results],
             "evaluations": sum(each.evaluations for each in results),
         }
-        run.finish({**facts, **origin()})
+        run.finish({**facts, **more(place, trials), **origin()})
 
 
 @dataclass(frozen=True)
@@ -76,10 +77,21 @@ class Noise(_DepthTable):
 
 @dataclass(frozen=True)
 class Focal(_DepthTable):
-    """The same from a tenth of the depths, seen at other focal lengths. A second run goes on."""
+    """The same from a tenth of the depths, seen at other focal lengths; and what was fitted at one, looked at through
+    the others. A second run goes on."""
 
     def run(self) -> None:
-        self._run("focal")
+        self._run("focal", self._tested)
+
+    def _tested(self, place: Place, trials: list[Trial]) -> dict:
+        usual, found = [trial for trial in trials if trial.focal_ratio == 1.0], []
+        with progress("looking through others", len(usual)) as bar:
+            for some in each_done(partial(looks, place), usual, self.jobs):
+                found += some
+                bar.advance()
+        rows = sorted(look_rows(found), key=lambda row: (self.classes.index(str(row["class"])), str(row["method"])))
+        show_table(rows)
+        return {"tests": rows}
 
 
 @dataclass(frozen=True)
