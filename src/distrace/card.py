@@ -1,7 +1,6 @@
 """What to know of a model: its shapes beside the true ones, walks between codes, and what it was trained on."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +13,6 @@ from distrace.checkpoint import Model
 from distrace.data.solid import solid_of
 from distrace.data.split import Shape
 from distrace.data.view import observe
-from distrace.evaluate import Result
 from distrace.render import render
 from distrace.report import View
 from distrace.shading import Picture, grid, side_by_side
@@ -24,23 +22,6 @@ ACROSS = 8  # pairs in a row
 WALKS, STRIDES = 4, 8
 
 
-@dataclass(frozen=True)
-class Quality:
-    """Of several Chamfer distances."""
-
-    mean: float
-    median: float
-    worst: float
-
-    @staticmethod
-    def of(results: Sequence[Result]) -> "Quality":
-        values = np.array([result.chamfer for result in results])
-        return Quality(float(values.mean()), float(np.median(values)), float(values.max()))
-
-    def __str__(self) -> str:
-        return f"mean {self.mean:.2f}, median {self.median:.2f}, worst {self.worst:.2f}"
-
-
 def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Picture:
     """Of each training shape the true surface, and beside it what the model makes of its code."""
     camera, pairs = poster_view(TILE), []
@@ -48,7 +29,7 @@ def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Pictur
         if shape.name in model.shapes:
             truth = observe(solid_of(shape, meshes), camera).shaded
             assert truth is not None
-            pairs.append(side_by_side([truth, _shaded(model, model.codes[model.shapes.index(shape.name)])], gap=0))
+            pairs.append(side_by_side([truth, _shaded(model, model.code_of(shape.name))], gap=0))
     blank = np.full_like(pairs[0], 255)
     pairs += [blank] * (-len(pairs) % min(ACROSS, len(pairs)))
     return grid([pairs[k : k + ACROSS] for k in range(0, len(pairs), ACROSS)])

@@ -48,6 +48,10 @@ class Model:
             raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])
 
+    def code_of(self, shape: str) -> Float[Tensor, "length"]:
+        """Of a shape that it was trained on, by name."""
+        return self.codes[self.shapes.index(shape)]
+
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
 

@@ -15,7 +15,7 @@ from distrace.code_residuals import Comparison
 from distrace.data.samples import sample
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape
-from distrace.data.view import View, observe
+from distrace.data.view import observe
 from distrace.fit import FitConfig
 from distrace.fit_code import CodeFitConfig, fit_points
 from distrace.losses import Weights
@@ -24,7 +24,6 @@ from distrace.methods import METHODS, steps_of
 from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
-from distrace.starts import Step
 
 OBSERVATION_SIZE = 256
 TOLD = 20_000  # distances that a held-out shape is told by
@@ -61,18 +60,15 @@ class Result:
 def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
     """Each training shape as its code gives it, against the outer surface of its mesh."""
     for shape in shapes:
-        if shape.split == "train" and shape.name in model.shapes:
-            truth = solid_of(shape, meshes).surface
-            code = model.codes[model.shapes.index(shape.name)]
+        if shape.name in model.shapes:
+            truth, code = solid_of(shape, meshes).surface, model.code_of(shape.name)
             yield compared(shape.name, "training code", 0, model, code, truth, 0.0, resolution)
 
 
 def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
     """Each held-out shape as the code says it best: fitted to distances all around it."""
     for shape in shapes:
-        if shape.split == "test":
-            solid = solid_of(shape, meshes)
-            yield best_told(model, shape.name, solid, resolution)
+        yield best_told(model, shape.name, solid_of(shape, meshes), resolution)
 
 
 def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
@@ -88,18 +84,12 @@ def completion_results(
 ) -> Iterator[Result]:
     """Each held-out shape completed from `points` depths of one view, by each method."""
     for shape in shapes:
-        if shape.split == "test":
-            solid = solid_of(shape, meshes)
-            view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
-            for method in METHODS:
-                step, seconds = completed(model, view, method, config)
-                yield compared(shape.name, method, points, model, step.code, solid.surface, seconds, resolution)
-
-
-def completed(model: Model, view: View, method: str, config: FitConfig) -> tuple[Step, float]:
-    """The last step of a method's fit, and how long all of it took."""
-    steps = list(steps_of(model, view, method, config))
-    return steps[-1], sum(step.seconds for step in steps)
+        solid = solid_of(shape, meshes)
+        view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
+        for method in METHODS:
+            steps = list(steps_of(model, view, method, config))
+            seconds = sum(step.seconds for step in steps)
+            yield compared(shape.name, method, points, model, steps[-1].code, solid.surface, seconds, resolution)
 
 
 def compared(

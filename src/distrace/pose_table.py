@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
-from functools import cache
 from pathlib import Path
 from statistics import median
 
@@ -12,7 +11,6 @@ import torch
 
 from distrace.camera import Camera
 from distrace.charts import steps_chart
-from distrace.checkpoint import Model, load_model
 from distrace.data.view import View
 from distrace.errors import explained
 from distrace.files import save_json
@@ -20,6 +18,7 @@ from distrace.fit_camera import CameraConfig, fit_camera
 from distrace.page import page, paragraph, section, short, table
 from distrace.pose import object_in_camera, pose_error, turned_object, with_object_at, zoomed
 from distrace.render import render
+from distrace.trials import opened_once
 
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST
 DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tenth of the distance
@@ -88,7 +87,7 @@ def read_trials(path: Path, model: str) -> list[Found]:
 
 
 def found(model: str, trial: Trial) -> Found:
-    shapes = _opened(model)
+    shapes = opened_once(model)
     random = torch.Generator().manual_seed(FIRST_SEED + trial.camera)
     camera = random_camera(random)
     field = shapes.field(trial.camera % len(shapes.codes))
@@ -130,13 +129,6 @@ def disturbed(camera: Camera, how: str, random: torch.Generator) -> Camera:
     axis, aside = (each / each.norm() for each in torch.randn(2, 3, generator=random))
     turn = torch.deg2rad(torch.tensor(float(how.removesuffix("°"))))
     return turned_object(camera, axis * turn, aside * translation.norm() / 10)
-
-
-@cache
-def _opened(model: str) -> Model:
-    opened = load_model(model)
-    opened.decoder.requires_grad_(False)
-    return opened
 
 
 def rows_of(model: str, done: Sequence[Found]) -> list[dict[str, object]]:

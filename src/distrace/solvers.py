@@ -66,12 +66,11 @@ class SolverRow:
 def solver_rows(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[tuple[SolverRow, Curve]]:
     """Each held-out shape completed from some and from all depths of one view and its mask, by both."""
     for shape in shapes:
-        if shape.split == "test":
-            solid = solid_of(shape, meshes)
-            full = replace(observe(solid, poster_view(OBSERVATION_SIZE)), normal=None)
-            for points in POINTS:
-                view = full.sparse(points, ADAM.seed) if points else full
-                yield from compared(model, shape.name, points, view, solid.surface, resolution)
+        solid = solid_of(shape, meshes)
+        full = replace(observe(solid, poster_view(OBSERVATION_SIZE)), normal=None)
+        for points in POINTS:
+            view = full.sparse(points, ADAM.seed) if points else full
+            yield from compared(model, shape.name, points, view, solid.surface, resolution)
 
 
 def compared(

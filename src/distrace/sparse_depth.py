@@ -13,17 +13,17 @@ from pathlib import Path
 import numpy as np
 
 from distrace.camera import Camera
-from distrace.checkpoint import Model, load_model
+from distrace.checkpoint import Model
 from distrace.data.noise import NOISES, noisy
 from distrace.data.solid import Solid, solid_of
-from distrace.data.split import Shape, read_split
+from distrace.data.split import Shape, on_side, shape_of
 from distrace.data.view import View, observe
 from distrace.files import save_json
 from distrace.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.methods import steps_of
 from distrace.metrics import chamfer
-from distrace.trials import read_json
+from distrace.trials import opened_once, read_json
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
 RATIOS = (0.5, 0.71, 1.0, 1.41, 2.0)  # of focal lengths to the usual one
@@ -61,7 +61,7 @@ class Place:
     resolution: int = 192  # of the meshes that are compared
 
     def model_of(self, category: str) -> Model:
-        return _opened(dict(self.models)[category])
+        return opened_once(dict(self.models)[category])
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def all_trials(
 
 def held_out(category: str, count: int | None = None) -> list[Shape]:
     """A split's shapes to test on; `count` of them, evenly spread."""
-    shapes = [shape for shape in read_split(category) if shape.split == "test"]
+    shapes = on_side("test", category)
     if count is None or count >= len(shapes):
         return shapes
     return [shapes[k * len(shapes) // count] for k in range(count)]
@@ -179,13 +179,7 @@ def _nothing() -> np.ndarray:
 @lru_cache(maxsize=4)
 def true_solid(meshes: Path, category: str, name: str) -> Solid:
     """A shape of a split; looked for once."""
-    (shape,) = (shape for shape in read_split(category) if shape.name == name)
-    return solid_of(shape, meshes)
-
-
-@lru_cache
-def _opened(name: str) -> Model:
-    return load_model(name)
+    return solid_of(shape_of(category, name), meshes)
 
 
 @lru_cache

@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
-from distrace.checkpoint import load_model
 from distrace.data.solid import solid_of
-from distrace.data.split import read_split
+from distrace.data.split import on_side, shape_of
 from distrace.data.view import observe
 from distrace.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
@@ -20,7 +19,7 @@ from distrace.methods import completing
 from distrace.metrics import chamfer, surface_points
 from distrace.plausible import plausible, spread
 from distrace.sparse_depth import camera_of, hash_of
-from distrace.trials import each_done
+from distrace.trials import each_done, opened_once
 
 COMPLETIONS = 6  # whose spread is taken
 POINTS = 100  # observed depths, besides the silhouette
@@ -42,14 +41,12 @@ class SpreadRow:
 
 def spread_rows(category: str, model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
     """Each held-out shape of a split."""
-    names = [shape.name for shape in read_split(category) if shape.split == "test"]
+    names = [shape.name for shape in on_side("test", category)]
     return each_done(partial(_row, category, model, meshes), names, jobs)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
-    opened = load_model(model)
-    (shape,) = (shape for shape in read_split(category) if shape.name == name)
-    truth, seed = solid_of(shape, meshes), hash_of(name)
+    opened, truth, seed = opened_once(model), solid_of(shape_of(category, name), meshes), hash_of(name)
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
     steps = list(completing(opened, view, CodeFitConfig()))
     others = list(plausible(opened, view, COMPLETIONS, seed=seed))

@@ -8,10 +8,9 @@ from statistics import mean, median
 import torch
 
 from distrace.checkpoint import Model
-from distrace.data.solid import solid_of
-from distrace.data.split import Shape, read_split
+from distrace.data.split import on_side
 from distrace.decoder import NetworkSpecs
-from distrace.evaluate import best_told, compared
+from distrace.evaluate import held_out_results, training_results
 from distrace.train import TrainConfig, load_samples, start, train
 
 SPECS = NetworkSpecs((256,) * 8)
@@ -53,19 +52,21 @@ def choice_rows(
     samples: Path, split: str, meshes: Path, steps: int, resolution: int, choices: Sequence[Choice] = CHOICES
 ) -> Iterator[ChoiceRow]:
     """Each choice with as many steps. Raises `ValueError` for missing samples or meshes."""
-    shapes = read_split(split)
-    learnt = [shape.name for shape in shapes if shape.split == "train"]
+    learnt, held_out = (on_side(side, split) for side in ("train", "test"))
+    shown = learnt[:: max(len(learnt) // SHOWN, 1)]
     for choice in choices:
         paths = [
             path
-            for name in learnt
-            for path in sorted(samples.glob(f"{name}.npz")) + sorted(samples.glob(f"{name}~*.npz"))
+            for shape in learnt
+            for path in sorted(samples.glob(f"{shape.name}.npz")) + sorted(samples.glob(f"{shape.name}~*.npz"))
             if choice.learnt(path.stem.partition("~")[2])
         ]
         if not paths:
             raise ValueError(f"{samples} holds no samples of {split}; `distrace sample --split {split}` makes them")
         model = _trained(paths, replace(choice.config, steps=steps))
-        yield _row(choice.name, model, shapes, meshes, steps, resolution)
+        told = [result.chamfer for result in training_results(model, shown, meshes, resolution)]
+        unseen = [result.chamfer for result in held_out_results(model, held_out, meshes, resolution)]
+        yield ChoiceRow(choice.name, len(paths), steps, mean(told), median(unseen), mean(unseen))
 
 
 def _trained(paths: list[Path], config: TrainConfig) -> Model:
@@ -75,19 +76,3 @@ def _trained(paths: list[Path], config: TrainConfig) -> Model:
         pass
     training.decoder.eval().requires_grad_(False)
     return Model("choice", training.decoder, training.codes.detach(), tuple(loaded.names))
-
-
-def _row(name: str, model: Model, shapes: list[Shape], meshes: Path, steps: int, resolution: int) -> ChoiceRow:
-    known = [shape for shape in shapes if shape.name in model.shapes]
-    some = known[:: max(len(known) // SHOWN, 1)]
-    codes = [model.codes[model.shapes.index(shape.name)] for shape in some]
-    told = [
-        compared(shape.name, name, 0, model, code, solid_of(shape, meshes).surface, 0.0, resolution).chamfer
-        for shape, code in zip(some, codes, strict=True)
-    ]
-    unseen = [
-        best_told(model, shape.name, solid_of(shape, meshes), resolution).chamfer
-        for shape in shapes
-        if shape.split == "test"
-    ]
-    return ChoiceRow(name, len(model.codes), steps, mean(told), median(unseen), mean(unseen))

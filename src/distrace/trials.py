@@ -3,12 +3,14 @@
 import json
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from functools import cache
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
 import torch
 
+from distrace.checkpoint import Model, load_model
 from distrace.errors import explained
 
 Trial = TypeVar("Trial")
@@ -26,6 +28,12 @@ def each_done(work: Callable[[Trial], Result], wanted: Sequence[Trial], jobs: in
                 yield done.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+@cache
+def opened_once(name: str) -> Model:
+    """A model, read once by each process."""
+    return load_model(name)
 
 
 def read_json(path: Path) -> Any:

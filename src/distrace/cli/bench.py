@@ -13,7 +13,7 @@ from distrace.bench import measure, poster_view
 from distrace.checkpoint import Model
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
-from distrace.data.split import read_split
+from distrace.data.split import on_side
 from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 
@@ -117,9 +117,8 @@ class Bench:
         run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
 
     def _solvers(self, run: Run, model: Model) -> None:
-        shapes, measured = read_split(self.split), []
-        count = sum(shape.split == "test" for shape in shapes) * len(solvers.POINTS) * 2
-        with progress("solvers", count) as bar:
+        shapes, measured = on_side("test", self.split), []
+        with progress("solvers", 2 * len(shapes) * len(solvers.POINTS)) as bar:
             for row, curve in solvers.solver_rows(model, shapes, self.meshes, solvers.RESOLUTION):
                 measured.append((row, curve))
                 bar.advance(f"{row.shape}, {row.points or 'all'} depths, {row.solver}: {row.loss:.4f}")

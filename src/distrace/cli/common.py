@@ -19,6 +19,9 @@ from distrace.render import Buffers
 from distrace.report import View
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+Meshes = Annotated[
+    Path, tyro.conf.arg(help="as `distrace data furniture` and `… planes` make them, in folders of their own")
+]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 

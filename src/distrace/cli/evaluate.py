@@ -1,6 +1,6 @@
 """`evaluate`: tables of results, as JSON, as pictures and in the terminal."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -9,11 +9,11 @@ from typing import Annotated
 import tyro
 
 from distrace import pose_table, shading
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.common import Meshes, ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
 from distrace.cli.evaluate_data import Card, Choices, Splits
 from distrace.cli.evaluate_depth import Focal, Noise, SparseDepth, Spread
-from distrace.data.split import Shape, read_split
+from distrace.data.split import on_side
 from distrace.evaluate import (
     Result,
     completion_results,
@@ -36,54 +36,46 @@ SHORT = {
 
 
 @dataclass(frozen=True)
-class Training:
+class _OfSplit:
+    model: ModelName = "sofas"
+    split: str | None = None  # by default that of the model's name
+    meshes: Meshes = Path("out")
+    out: Path = Path("out/evaluate")
+    resolution: int = 256  # of the meshes that are compared
+
+    def _run(self, name: str, side: str, results_of: Callable[..., Iterable[Result]], methods: int = 1) -> None:
+        run, split = start(self.out), self.split or self.model
+        shapes = on_side(side, split)
+        results = results_of(opened(self.model, run.device), shapes, self.meshes, resolution=self.resolution)
+        _recorded(run, name, self.model, results, methods * len(shapes))
+
+
+@dataclass(frozen=True)
+class Training(_OfSplit):
     """How well a model knows the shapes that it was trained on."""
 
-    model: ModelName = "sofas"
-    split: str | None = None  # by default that of the model's name
-    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
-    out: Path = Path("out/evaluate")
-    resolution: int = 256  # of the meshes that are compared
-
     def run(self) -> None:
-        run, shapes = start(self.out), read_split(self.split or self.model)
-        results = training_results(opened(self.model, run.device), shapes, self.meshes, self.resolution)
-        _recorded(run, "training", self.model, results, _count(shapes, "train"))
+        self._run("training", "train", training_results)
 
 
 @dataclass(frozen=True)
-class HeldOut:
+class HeldOut(_OfSplit):
     """How well a model can say the shapes that it was not trained on, told distances all around them."""
 
-    model: ModelName = "sofas"
-    split: str | None = None  # by default that of the model's name
-    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
-    out: Path = Path("out/evaluate")
-    resolution: int = 256  # of the meshes that are compared
-
     def run(self) -> None:
-        run, shapes = start(self.out), read_split(self.split or self.model)
-        results = held_out_results(opened(self.model, run.device), shapes, self.meshes, self.resolution)
-        _recorded(run, "held-out", self.model, results, _count(shapes, "test"))
+        self._run("held-out", "test", held_out_results)
 
 
 @dataclass(frozen=True)
-class Completion:
+class Completion(_OfSplit):
     """Held-out shapes completed from some depths of one view, by DeepSDF and by Adam on renderings."""
 
-    model: ModelName = "sofas"
-    split: str | None = None  # by default that of the model's name
-    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
-    out: Path = Path("out/evaluate")
     points: int = 100  # observed depths
     seed: int = 0
-    resolution: int = 256  # of the meshes that are compared
 
     def run(self) -> None:
-        run, shapes, config = start(self.out), read_split(self.split or self.model), FitConfig(seed=self.seed)
-        model = opened(self.model, run.device)
-        results = completion_results(model, shapes, self.meshes, self.points, config, self.resolution)
-        _recorded(run, "completion", self.model, results, _count(shapes, "test") * len(METHODS))
+        results = partial(completion_results, points=self.points, config=FitConfig(seed=self.seed))
+        self._run("completion", "test", results, len(METHODS))
 
 
 @dataclass(frozen=True)
@@ -138,10 +130,6 @@ class Evaluate:
 
     def run(self) -> None:
         self.table.run()
-
-
-def _count(shapes: list[Shape], side: str) -> int:
-    return sum(shape.split == side for shape in shapes)
 
 
 def _recorded(run: Run, name: str, model: str, results: Iterable[Result], count: int) -> None:

@@ -4,9 +4,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from distrace.card import pairs_picture, shapes_table, walks_picture
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.common import Meshes, ModelName, opened, show_table
 from distrace.cli.console import console, origin, progress, start
-from distrace.data.split import read_split
+from distrace.data.split import CLASSES, read_split
 from distrace.files import save_json, save_text
 from distrace.shading import save_png
 from distrace.split_table import nearest_rows, used
@@ -17,8 +17,8 @@ from distrace.training_choices import CHOICES, choice_rows
 class Splits:
     """How near the held-out shapes of a split are to those trained on, and which shapes are near-variants."""
 
-    splits: tuple[str, ...] = ("sofas", "planes", "tables", "chairs")  # bundled ones, or CSV files
-    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    splits: tuple[str, ...] = CLASSES  # bundled ones, or CSV files
+    meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
 
     def run(self) -> None:
@@ -38,7 +38,7 @@ class Choices:
 
     samples: Path = Path("out/samples")  # of the split, with `--mirror --variants 4`
     split: str = "chairs"
-    meshes: Path = Path("out")
+    meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     steps: int = 6000  # of each
     resolution: int = 128  # of the meshes that are compared
@@ -60,7 +60,7 @@ class Card:
 
     model: ModelName = "sofas"
     split: str | None = None  # by default that of the model's name
-    meshes: Path = Path("out")
+    meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
 
     def run(self) -> None:

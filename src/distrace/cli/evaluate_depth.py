@@ -7,16 +7,15 @@ from pathlib import Path
 from statistics import median
 
 from distrace import depth_tables
-from distrace.cli.common import show_table
+from distrace.cli.common import Meshes, show_table
 from distrace.cli.console import console, origin, progress, start
+from distrace.data.split import CLASSES, on_side
 from distrace.files import save_text
 from distrace.focal_test import look_rows, looks
 from distrace.methods import METHODS
-from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
+from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done
 from distrace.spread_table import spread_rows
 from distrace.trials import each_done
-
-CLASSES = ("sofas", "planes", "tables", "chairs")
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class _DepthTable:
     methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
     shapes: int | None = None  # held-out ones of each class; by default all
     views: int = len(AZIMUTHS_ELEVATIONS)  # of each shape
-    meshes: Path = Path("out")  # as `distrace data furniture` and `… planes` make them, in folders of their own
+    meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     resolution: int = 192  # of the meshes that are compared
     jobs: int = 2  # processes
@@ -100,13 +99,13 @@ class Spread:
 
     classes: tuple[str, ...] = CLASSES
     models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
-    meshes: Path = Path("out")
+    meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
 
     def run(self) -> None:
         run, rows = start(self.out), []
-        with progress("spread", sum(len(held_out(category)) for category in self.classes)) as bar:
+        with progress("spread", sum(len(on_side("test", category)) for category in self.classes)) as bar:
             for category, model in paired(self.classes, self.models):
                 for row in spread_rows(category, model, self.meshes, self.jobs):
                     rows.append(asdict(row))

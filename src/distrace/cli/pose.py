@@ -50,7 +50,6 @@ class Pose:
     def run(self) -> None:
         run = start(self.out, self.device)
         model, observed = opened(self.model, run.device), read_view(self.observation)
-        model.decoder.requires_grad_(False)
         field = model.field(_code(model, self.code))
         first = self._start(observed.camera)
         steps = []

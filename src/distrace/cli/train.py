@@ -13,7 +13,7 @@ from distrace.checkpoint import Model, save_experiment
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
 from distrace.data import sampling
-from distrace.data.split import every_mesh, has_meshes, read_split
+from distrace.data.split import every_mesh, has_meshes, on_side
 from distrace.decoder import NetworkSpecs
 from distrace.render import render
 from distrace.report import View
@@ -84,7 +84,7 @@ def _sampled_meshes(meshes: Path, out: Path) -> Path:
 def _sample_files(folder: Path, split: str | None) -> list[Path]:
     paths = sorted(folder.glob("*.npz"))
     if split:
-        wanted = {shape.name for shape in read_split(split) if shape.split == "train"}
+        wanted = {shape.name for shape in on_side("train", split)}
         paths = [path for path in paths if path.stem.split("~")[0] in wanted]
     if not paths:
         raise ValueError(f"{folder} holds no samples (.npz) to learn; `distrace sample` makes them")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from distrace.errors import explained
 
+CLASSES = ("sofas", "planes", "tables", "chairs")  # with bundled splits and models
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".ac")
 
 
@@ -55,6 +56,19 @@ def _shape(row: dict[str, str]) -> Shape:
 
 def _bundled() -> str:
     return ", ".join(sorted(Path(entry.name).stem for entry in (files("distrace") / "splits").iterdir()))
+
+
+def on_side(side: str, split: str | Path) -> list[Shape]:
+    """Those of a split on its side `train` or `test`."""
+    return [shape for shape in read_split(split) if shape.split == side]
+
+
+def shape_of(split: str | Path, name: str) -> Shape:
+    """Raises `ValueError` where the split has no shape of that name."""
+    for shape in read_split(split):
+        if shape.name == name:
+            return shape
+    raise ValueError(f"the split {split} has no shape {name}")
 
 
 def every_mesh(folder: Path) -> list[Shape]:
