@@ -21,7 +21,7 @@ from distrace.cli import main
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.resume import NAME, load_training, save_training
-from distrace.train import Samples, TrainConfig, Training, bound_codes, draw, load_samples, start, train
+from distrace.train import Samples, TrainConfig, Training, bound_codes, draw, load_samples, start, train, training_loss
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
@@ -131,6 +131,17 @@ def test_a_run_that_was_stopped_ends_bit_for_bit_like_one_that_was_not(tmp_path:
     steps = [step.step for step in train(samples, resumed, config)]
     assert steps == list(range(stop + 1, CONFIG.steps + 1))
     assert_same(resumed, finished(samples, CONFIG))
+
+
+def test_samples_of_wrong_sign_and_large_errors_count_more() -> None:
+    values, distances = torch.tensor([0.01, 0.01, 0.3]), torch.tensor([0.02, -0.02, 0.05])
+    errors = torch.tensor([0.01, 0.03, 0.05])  # beyond 0.1 all is far
+    torch.testing.assert_close(training_loss(values, distances, CONFIG), errors.mean())
+    wrong = training_loss(values, distances, replace(CONFIG, wrong_sign=4.0))
+    torch.testing.assert_close(wrong, (errors * torch.tensor([1.0, 4.0, 1.0])).mean())
+    large = training_loss(values, distances, replace(CONFIG, large=0.02))
+    squared = torch.tensor([0.01, (0.03**2 + 0.02**2) / 0.04, (0.05**2 + 0.02**2) / 0.04])
+    torch.testing.assert_close(large, squared.mean())
 
 
 def test_another_seed_gives_another_network() -> None:

@@ -30,6 +30,8 @@ class TrainConfig:
         0.4  # share of the steps; until it begins, a run can be given more steps as if it had them always
     )
     clamp: float = 0.1  # distances beyond are learnt as "far"
+    wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
+    large: float = torch.inf  # errors above count by their squares: what fills gaps is far off, and rare
     code_penalty: float = 1e-4
     code_bound: float = 1.0
     code_deviation: float = 0.05  # of a code's entries at the start
@@ -122,7 +124,7 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
         codes = training.codes[shapes]
         with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
             values = training.decoder(batch[..., :3], codes[:, None])
-        loss = clamped_loss(values.float(), batch[..., 3], config.clamp)
+        loss = training_loss(values.float(), batch[..., 3], config)
         training.optimiser.zero_grad()
         (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
         training.optimiser.step()
@@ -141,9 +143,25 @@ def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "
     return shapes, torch.stack(batch)
 
 
+def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:
+    """The clamped loss where samples that matter for the shape, but are few, count more.
+
+    Those with a wrong sign are what thin parts are lost by (cf. Duan et al., *Curriculum DeepSDF*, ECCV 2020, section
+    3.2); large errors, of a reverse Huber loss (Laina et al., 3DV 2016, section 3.2), what gaps are filled by.
+    """
+    off, limit = clamped_error(values, distances, config.clamp), config.large
+    if limit < torch.inf:
+        off = torch.where(off > limit, (off.square() + limit**2) / (2 * limit), off)
+    return (torch.where(values * distances < 0, config.wrong_sign, 1.0) * off).mean()
+
+
 def clamped_loss(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
     """Mean |clamp(f) − clamp(d)| (Park et al. 2019, eq. 4)."""
-    return (values.clamp(-clamp, clamp) - distances.clamp(-clamp, clamp)).abs().mean()
+    return clamped_error(values, distances, clamp).mean()
+
+
+def clamped_error(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
+    return (values.clamp(-clamp, clamp) - distances.clamp(-clamp, clamp)).abs()
 
 
 @torch.no_grad()

@@ -44,6 +44,9 @@ CHOICES = [
     Choice("and warped twice", lambda variant: variant not in ("warped3", "warped4")),
     Choice("and warped four times", lambda variant: True),
     Choice("… variants drawn as often as shapes", lambda variant: True, TrainConfig(variant_weight=1.0)),
+    Choice(
+        "… wrong signs and large errors counted more", lambda variant: True, TrainConfig(wrong_sign=4.0, large=0.01)
+    ),
     Choice("… codes held ten times tighter", lambda variant: True, TrainConfig(code_penalty=1e-3)),
 ]
 

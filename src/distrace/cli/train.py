@@ -37,6 +37,8 @@ class Train:
     split: str | None = None  # learn only the training shapes of this split, and their variants
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
+    wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
+    large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
     samples_per_step: int = TrainConfig.samples_per_step
     layers: int = 8
     width: int = 512
@@ -53,20 +55,23 @@ class Train:
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
-            config = config if self.steps is None else replace(config, steps=self.steps)
+            config = self._changed(config)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
             specs = NetworkSpecs(
                 (self.width,) * self.layers, self.code_length, (self.layers // 2,), tuple(range(self.layers))
             )
-            config = TrainConfig(
-                steps=self.steps or TrainConfig.steps, samples_per_step=self.samples_per_step, seed=self.seed
-            )
+            config = self._changed(TrainConfig(samples_per_step=self.samples_per_step, seed=self.seed))
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
             training = start_training(len(loaded.names), specs, config, run.device)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         loss = _run(run, loaded, training, config, self.save_every)
         run.finish({"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16})
+
+    def _changed(self, config: TrainConfig) -> TrainConfig:
+        """What was said replaces defaults, and what a run had before."""
+        said = {name: getattr(self, name) for name in ("steps", "wrong_sign", "large")}
+        return replace(config, **{name: value for name, value in said.items() if value is not None})
 
 
 def _has_samples(folder: Path) -> bool:
