@@ -14,7 +14,7 @@ from distrace.starts import Step
 
 METHODS = ("deepsdf", "ours", "ours+mask")  # of the published table
 CLOUDS = ("points", "points+normals")  # ours, not knowing the camera
-SAMPLES = 2000  # of each of DeepSDF's iterations, where the original has 8,000: docs/from_the_paper.md
+SAMPLES = 500  # of each of DeepSDF's iterations, where the original has 8,000: docs/from_the_paper.md
 
 
 def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitConfig) -> Iterator[Step]:
