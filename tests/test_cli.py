@@ -331,7 +331,7 @@ def test_evaluate_choices_trains_small_networks(
     where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
     run("evaluate", "choices", *where, "--steps", 60, "--resolution", 24)
     rows = result(tmp_path / "out", "rows")["rows"]
-    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4]
+    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4, 4]
     assert all(row["held_out_median"] > 0 for row in rows)
 
 
