@@ -272,26 +272,27 @@ def test_evaluate_held_out_tells_a_model_all_distances(
     assert (row["shape"], row["method"]) == ("held", "all distances")
 
 
-def test_evaluate_sparse_depth_writes_a_table_and_goes_on(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
-) -> None:
+@pytest.fixture
+def depth_table(model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path) -> Callable[[str], None]:
     split, meshes = spheres_split
     where = ("--classes", split, "--models", model, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
-    run("evaluate", "sparse-depth", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    return lambda name: run("evaluate", name, *where, "--methods", "points", "--views", 1, "--jobs", 1)
+
+
+def test_evaluate_sparse_depth_writes_a_table_and_goes_on(depth_table: Callable[[str], None], tmp_path: Path) -> None:
+    depth_table("sparse-depth")
     facts = result(tmp_path, "rows", "ratios", "instances", "evaluations")
     assert [row["density"] for row in facts["rows"]] == ["dense", "50%", "10%", "100", "50", "20"]
     assert len(facts["instances"]) == 6
     before = {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")}
-    run("evaluate", "sparse-depth", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    depth_table("sparse-depth")
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")} == before
 
 
 def test_evaluate_focal_also_looks_at_what_was_fitted_through_other_focal_lengths(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
+    depth_table: Callable[[str], None], tmp_path: Path
 ) -> None:
-    split, meshes = spheres_split
-    where = ("--classes", split, "--models", model, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
-    run("evaluate", "focal", *where, "--methods", "points", "--views", 1, "--jobs", 1)
+    depth_table("focal")
     facts = result(tmp_path, "rows", "tests")
     assert [row["focal_ratio"] for row in facts["rows"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
     assert [row["tested_at"] for row in facts["tests"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
@@ -352,7 +353,7 @@ def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Co
     assert fitted(surface).abs().mean() < 0.03
     facts = result(tmp_path, "evaluations", "loss", "terms")
     assert set(facts["terms"]) == {"depth", "missing", "extra", "code"}
-    assert "16, after 3 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "16, after 4 of each of 2 starts" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
@@ -515,6 +516,8 @@ BAD = [
     ("train {tmp}/samples", "is not a file of samples"),
     ("train {tmp}/good --split sofas", "holds no samples"),
     ("train {tmp}/good --out {tmp}/stopped", "is not a checkpoint of a training run"),
+    ("train {tmp}/good --wrong-sign 0", "wrong sign 0 times"),
+    ("train {tmp}/good --large -1", "above -1 squared"),
     ("train {tmp}/good --layers 2 --width 4", "each must be at least 1"),
     ("train {tmp}/good --code-length 0", "each must be at least 1"),
 ]

@@ -13,6 +13,7 @@ from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.losses import Weights
+from distrace.nearest import Hints, first_of
 from distrace.prior import Prior
 from distrace.render import render
 from distrace.solver import SolverConfig, minimise
@@ -22,6 +23,7 @@ from distrace.targets import Pool
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
 TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
+OTHERS = torch.tensor([[0.0, 0.0, 0.0, 0.0], [-0.6, 0.5, 0.1, 0.6], [0.8, 0.6, -0.7, 0.1]])
 CONFIG = CodeFitConfig(starts=1, compared=Comparison(weights=Weights(code=1e-6)))
 
 
@@ -192,3 +194,57 @@ def test_no_view_and_nonsense_are_refused(decoder: Decoder) -> None:
     for wrong in ({"iterations": 0}, {"starts": -1}, {"stages": 0}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong.values()))}.*at least 1"):
             CodeFitConfig(**wrong)
+
+
+def hints_of(seen: View) -> Hints:
+    random = torch.Generator().manual_seed(0)
+    return Hints.of(Seen.of([Pool.of(seen).draw(100, 300, random)], Weights()), random)
+
+
+def test_a_view_contradicts_its_own_shape_least(decoder: Decoder, view: View) -> None:
+    hints = hints_of(view)
+    own, *others = (hints.contradicted(decoder.field(code)) for code in (TRUE, *OTHERS))
+    assert own < 0.002
+    assert min(others) > 10 * own
+
+
+def test_a_surface_that_is_elsewhere_and_free_space_that_is_not_contradict(decoder: Decoder) -> None:
+    middle = torch.zeros(5, 3)
+    assert float(decoder.field(TRUE)(middle).max()) < -0.1, "the middle is deep inside"
+    surface, free = (Hints(middle, torch.full((5,), distance)) for distance in (0.0, torch.inf))
+    assert surface.contradicted(decoder.field(TRUE)) == pytest.approx(0.1)
+    assert free.contradicted(decoder.field(TRUE)) == pytest.approx(0.3)
+    assert Hints(middle, torch.full((5,), -0.5)).contradicted(decoder.field(TRUE)) == 0, "decoders say no more than 0.1"
+    outside = Hints(middle + 3.0, torch.full((5,), torch.inf))
+    assert outside.contradicted(decoder.field(TRUE)) == 0
+
+
+def test_starts_are_the_mean_the_nearest_codes_and_draws(decoder: Decoder, view: View) -> None:
+    prior = replace(PRIOR, codes=(*OTHERS, TRUE))
+    first = first_of(decoder, prior, hints_of(view), 2, seed=0)
+    mean, nearest = first.coordinates
+    torch.testing.assert_close(prior.code(mean), PRIOR.mean)
+    torch.testing.assert_close(prior.code(nearest), TRUE)
+    some = first_of(decoder, replace(prior, codes=(TRUE,)), hints_of(view), 4, seed=0).coordinates
+    assert len(some) == 4
+    assert len({tuple(w.tolist()) for w in some}) == 4
+    alone = first_of(decoder, prior, hints_of(view), 1, seed=0)
+    assert (len(alone.coordinates), alone.evaluations) == (1, 0)
+    assert first.evaluations > len(hints_of(view).points)
+
+
+def test_the_search_for_starts_is_counted(decoder: Decoder, view: View) -> None:
+    prior, config = replace(PRIOR, codes=tuple(OTHERS)), replace(CONFIG, iterations=1, starts=2)
+    (counted,) = [step.evaluations for step in fit_code(decoder, [view], prior, config)][:1]
+    (alone,) = [step.evaluations for step in fit_code(decoder, [view], prior, replace(config, starts=1))][:1]
+    assert counted - alone > 3 * 400 / 4, "three codes were asked for a quarter of the hints"
+
+
+def test_points_before_and_beside_a_surface_are_free(decoder: Decoder, view: View) -> None:
+    hints = hints_of(view)
+    values = decoder.field(TRUE)(hints.points)
+    free = hints.distances.isinf()
+    assert 100 < int(free.sum()) <= 400
+    assert float(values[free].min()) > -0.01
+    assert float(values[~free].abs().max()) < 0.01
+    assert float((hints.points - CAMERA.T_world_camera[:3, 3]).norm(dim=1).max()) < 3.6

@@ -16,6 +16,7 @@ ROUND = 16  # widths that processors like
 SAMPLED = 8  # deviations are measured at every so many points
 CPU_CHUNK = 4096  # a layer's activations then stay in the cache: 20 µs a point, against 45 µs in batches of 250 K
 GPU_CHUNK = 1 << 20
+FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond
 
 
 Layer = tuple[Tensor, Tensor]  # weight and bias

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any
 
@@ -15,10 +15,13 @@ from distrace.data.view import View
 from distrace.decoder import Decoder
 from distrace.fit import pools_of
 from distrace.losses import Weights
+from distrace.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.point_residuals import PointProblem
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.starts import Starts, Step, best_of
+
+ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
 
 
 @dataclass(frozen=True)
@@ -26,12 +29,12 @@ class CodeFitConfig(Starts):
     """Steps in stages. Each begins with a look along all rays; deviations beyond an ever smaller scale count less."""
 
     iterations: int = 16
-    trial: int = 3
+    trial: int = 4
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
     first_share: float = 0.3  # of them, in the first stage: while all is coarse, and starts compete
-    compared: Comparison = Comparison(Weights(code=0.05))  # the prior weighs more than Adam's: docs/from_the_paper.md
+    compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.42  # … and × this from one stage to the next
     damping: float = 0.1
@@ -60,7 +63,9 @@ def fit_code(
         targets = [pool.draw(config.depth_rays, round(config.mask_rays * share), random) for pool in pools]
         return Problem(decoder, prior, Seen.of(targets, config.compared.weights), config.compared)
 
-    return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
+    random = torch.Generator().manual_seed(config.seed)
+    some = Seen.of([pool.draw(DEPTHS, SILHOUETTE, random) for pool in pools], config.compared.weights)
+    return _best(decoder, prior, Hints.of(some, random), problem, config)
 
 
 def fit_points(
@@ -79,18 +84,26 @@ def fit_points(
         ]
         return PointProblem(decoder, prior, chosen, config.compared.weights)
 
-    return best_of(config, lambda start: _solved(problem, prior, config, start), recent=1)
+    random = torch.Generator().manual_seed(config.seed)
+    some = samples[torch.randperm(len(samples), generator=random)[: DEPTHS + SILHOUETTE]]
+    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config)
+
+
+def _best(decoder: Decoder, prior: Prior, hints: Hints, problem_of: ProblemOf, config: CodeFitConfig) -> Iterator[Step]:
+    """From all starts; the first step is charged with the search for them."""
+    first = first_of(decoder, prior, hints, config.starts, config.seed)
+    steps = best_of(config, lambda start: _solved(problem_of, prior, config, start, first.coordinates[start]), recent=1)
+    step = next(steps)
+    yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
+    yield from steps
 
 
 def _solved(
-    problem_of: Callable[[torch.Generator, float], Problem | PointProblem],
-    prior: Prior,
-    config: CodeFitConfig,
-    start: int,
+    problem_of: ProblemOf, prior: Prior, config: CodeFitConfig, start: int, w: Float[Tensor, "dimensions"]
 ) -> Iterator[Step]:
     """From one start, on the same rays or points as from the others."""
     began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
-    random, w = torch.Generator().manual_seed(config.seed), prior.start(start, config.seed)
+    random = torch.Generator().manual_seed(config.seed)
     problem: Any = None
     state = None
     for stage, length in enumerate(config.stage_lengths):

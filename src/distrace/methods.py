@@ -14,7 +14,7 @@ from distrace.starts import Step
 
 METHODS = ("deepsdf", "ours", "ours+mask")  # of the published table
 CLOUDS = ("points", "points+normals")  # ours, not knowing the camera
-SAMPLES = 500  # of each of DeepSDF's iterations, where the original has 8,000: docs/from_the_paper.md
+DEEPSDF = SampleFitConfig(samples=500)  # where the original has 8,000 in an iteration: docs/from_the_paper.md
 
 
 def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitConfig) -> Iterator[Step]:
@@ -27,11 +27,15 @@ def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitC
     cloud = Cloud(view.points(), None if view.normal is None else view.normal[view.seen])
     if method == "deepsdf":
         assert cloud.normals is not None, "DeepSDF is given the true normals"
-        samples = around_points(cloud.points, cloud.normals)
-        return fit_samples(model.decoder, samples, SampleFitConfig(samples=SAMPLES))
+        return fit_samples(model.decoder, around_points(cloud.points, cloud.normals), DEEPSDF)
     if method in CLOUDS:
         return completing(model, cloud if method == "points+normals" else cloud.without("normal"), config)
     return completing(model, replace(view, normal=None, mask=view.mask if method == "ours+mask" else None), config)
+
+
+def settings_of(method: str, config: FitConfig | CodeFitConfig) -> FitConfig | CodeFitConfig | SampleFitConfig:
+    """What a method follows."""
+    return DEEPSDF if method == "deepsdf" else config
 
 
 def completing(

@@ -14,13 +14,13 @@ from torch import Tensor
 from distrace.checkpoint import Model
 from distrace.data.cloud import Cloud
 from distrace.data.view import View
+from distrace.decoder import FAR
 from distrace.fit_code import CodeFitConfig
 from distrace.methods import completing
 from distrace.prior import DEVIATION, Prior, prior_of
 from distrace.starts import Step
 
 CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3)
-FAR = 0.1  # decoders say no more of distances beyond
 
 
 def plausible(

@@ -7,12 +7,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.code_residuals import derivatives, with_prior
-from distrace.decoder import Decoder
+from distrace.decoder import FAR, Decoder
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.solver import Residuals
-
-CLAMP = 0.1  # what is farther than this, on the right side, is right: decoders say no more
 
 
 @dataclass(frozen=True)
@@ -24,7 +22,10 @@ class Coordinates:
 
 @dataclass
 class PointProblem:
-    """Residuals f(p) − d of a code's coordinates at fixed points; surface points have d = 0."""
+    """Residuals f(p) − d of a code's coordinates at fixed points; surface points have d = 0.
+
+    What is farther than `FAR`, on the right side, is right.
+    """
 
     decoder: Decoder
     prior: Prior
@@ -43,7 +44,7 @@ class PointProblem:
         w, distances = at.w, self.samples[:, 3]
         values, _, by_code = derivatives(self.decoder, self.samples[:, :3], self.prior.code(w))
         self.evaluations += len(values)
-        far = (values.abs() > CLAMP) & (distances.abs() > CLAMP) & (values.sign() == distances.sign())
+        far = (values.abs() > FAR) & (distances.abs() > FAR) & (values.sign() == distances.sign())
         lacking = (values - distances).masked_fill(far, 0.0)
         jacobian = (by_code @ self.prior.basis).masked_fill(far[:, None], 0.0)
         weights = torch.full_like(lacking, self.counted.depth / len(lacking) / self.scale)

@@ -1,6 +1,7 @@
 """What is known of a shape before it is seen: the Gaussian of the codes that a decoder was trained with."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,9 +18,13 @@ class Prior:
 
     mean: Float[Tensor, "length"]
     basis: Float[Tensor, "length dimensions"]
+    codes: Sequence[Float[Tensor, "length"]] = ()  # that it was estimated from
 
     def code(self, w: Float[Tensor, "dimensions"]) -> Float[Tensor, "length"]:
         return self.mean + self.basis @ w
+
+    def coordinates(self, code: Float[Tensor, "length"]) -> Float[Tensor, "dimensions"]:
+        return torch.linalg.solve(self.basis, code - self.mean)
 
     def start(self, k: int, seed: int) -> Float[Tensor, "dimensions"]:
         """The coordinates of the mean shape, and for k > 0 those of a draw: from nearer to the mean than shapes are."""
@@ -34,9 +39,9 @@ def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
     """
     length = codes.shape[1]
     if len(codes) < 2:
-        return Prior(codes.new_zeros(length), 0.1 * torch.eye(length, device=codes.device))
+        return Prior(codes.new_zeros(length), 0.1 * torch.eye(length, device=codes.device), tuple(codes))
     mean = codes.mean(0)
     _, found, directions = torch.linalg.svd((codes - mean) / math.sqrt(len(codes) - 1))
     deviations = codes.new_zeros(length)
     deviations[: len(found)] = found
-    return Prior(mean, directions.T * (deviations**2 + (LEAST_DEVIATION * found.mean()) ** 2).sqrt())
+    return Prior(mean, directions.T * (deviations**2 + (LEAST_DEVIATION * found.mean()) ** 2).sqrt(), tuple(codes))

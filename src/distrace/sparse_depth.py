@@ -21,7 +21,7 @@ from distrace.data.view import View, observe
 from distrace.files import save_json
 from distrace.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
-from distrace.methods import steps_of
+from distrace.methods import settings_of, steps_of
 from distrace.metrics import chamfer
 from distrace.trials import opened_once, read_json
 
@@ -147,14 +147,14 @@ def observed(trial: Trial, meshes: Path) -> View:
 
 
 def done(place: Place, trial: Trial) -> Done:
-    """A trial's result: that of an earlier run with the same model, or a new one, which it leaves in a file."""
-    path, model = place.out / "trials" / trial.file, place.model_of(trial.category)
-    mark = fingerprint(model)
+    """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
+    path, model, config = place.out / "trials" / trial.file, place.model_of(trial.category), CodeFitConfig()
+    mark = fingerprint(model, place.resolution, settings_of(trial.method, config))
     if path.is_file():
         kept = read_json(path)
-        if kept.pop("model") == mark:
+        if kept.pop("made_by", None) == mark:
             return Done(Trial(**kept.pop("trial")), **kept)
-    steps = list(steps_of(model, observed(trial, place.meshes), trial.method, CodeFitConfig()))
+    steps = list(steps_of(model, observed(trial, place.meshes), trial.method, config))
     code = steps[-1].code
     mesh = extract_mesh(model.field(code), MeshConfig(place.resolution))
     truth = true_solid(place.meshes, trial.category, trial.shape).surface
@@ -167,7 +167,7 @@ def done(place: Place, trial: Trial) -> Done:
         sum(step.evaluations for step in steps),
         [round(x, 6) for x in code.tolist()],
     )
-    save_json(path, {"model": mark, **asdict(result)})
+    save_json(path, {"made_by": mark, **asdict(result)})
     return result
 
 
@@ -183,9 +183,9 @@ def true_solid(meshes: Path, category: str, name: str) -> Solid:
 
 
 @lru_cache
-def fingerprint(model: Model) -> str:
-    """Tells models apart: a change of the weights changes it."""
-    digest = hashlib.sha256()
+def fingerprint(model: Model, *settings: object) -> str:
+    """Tells models and settings apart: a change of a weight, or of a default, changes it."""
+    digest = hashlib.sha256(repr(settings).encode())
     for tensor in (*model.decoder.state_dict().values(), model.codes):
         digest.update(tensor.cpu().numpy().tobytes())
     return digest.hexdigest()[:16]

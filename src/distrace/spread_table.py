@@ -10,15 +10,14 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
-from distrace.data.solid import solid_of
-from distrace.data.split import on_side, shape_of
+from distrace.data.split import on_side
 from distrace.data.view import observe
 from distrace.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.methods import completing
 from distrace.metrics import chamfer, surface_points
 from distrace.plausible import plausible, spread
-from distrace.sparse_depth import camera_of, hash_of
+from distrace.sparse_depth import camera_of, hash_of, true_solid
 from distrace.trials import each_done, opened_once
 
 COMPLETIONS = 6  # whose spread is taken
@@ -46,7 +45,7 @@ def spread_rows(category: str, model: str, meshes: Path, jobs: int) -> Iterator[
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
-    opened, truth, seed = opened_once(model), solid_of(shape_of(category, name), meshes), hash_of(name)
+    opened, truth, seed = opened_once(model), true_solid(meshes, category, name), hash_of(name)
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
     steps = list(completing(opened, view, CodeFitConfig()))
     others = list(plausible(opened, view, COMPLETIONS, seed=seed))

@@ -43,6 +43,9 @@ class TrainConfig:
         if self.steps < 1 or self.samples_per_step < 1 or not 0 <= self.seed < 2**31:
             given = f"{self.steps} steps of {self.samples_per_step} samples with seed {self.seed}"
             raise ValueError(f"{given} were asked for; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
+        if not (self.wrong_sign > 0 and self.large > 0):
+            given = f"a wrong sign {self.wrong_sign:g} times as much, and errors above {self.large:g} squared"
+            raise ValueError(f"{given} were asked for; both must be above 0")
 
 
 @dataclass(frozen=True)

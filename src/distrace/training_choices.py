@@ -56,7 +56,6 @@ def choice_rows(
 ) -> Iterator[ChoiceRow]:
     """Each choice with as many steps. Raises `ValueError` for missing samples or meshes."""
     learnt, held_out = (on_side(side, split) for side in ("train", "test"))
-    shown = learnt[:: max(len(learnt) // SHOWN, 1)]
     for choice in choices:
         paths = [
             path
@@ -67,6 +66,8 @@ def choice_rows(
         if not paths:
             raise ValueError(f"{samples} holds no samples of {split}; `distrace sample --split {split}` makes them")
         model = _trained(paths, replace(choice.config, steps=steps))
+        known = [shape for shape in learnt if shape.name in model.shapes]
+        shown = known[:: max(len(known) // SHOWN, 1)]
         told = [result.chamfer for result in training_results(model, shown, meshes, resolution)]
         unseen = [result.chamfer for result in held_out_results(model, held_out, meshes, resolution)]
         yield ChoiceRow(choice.name, len(paths), steps, mean(told), median(unseen), mean(unseen))
