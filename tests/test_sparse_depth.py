@@ -97,7 +97,7 @@ def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
     kept = path.read_text()
     assert done(place, wanted) == first
     assert path.read_text() == kept
-    path.write_text(json.dumps(json.loads(kept) | {"model": "of another time", "seconds": -1.0}))
+    path.write_text(json.dumps(json.loads(kept) | {"made_by": "another model", "seconds": -1.0}))
     again = done(place, wanted)
     assert again.seconds > 0
     assert again.chamfer == pytest.approx(first.chamfer, rel=1e-6)

@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
+from statistics import mean
 
 import numpy as np
 import pytest
@@ -144,6 +145,13 @@ def test_samples_of_wrong_sign_and_large_errors_count_more() -> None:
     torch.testing.assert_close(large, squared.mean())
 
 
+def test_a_run_keeps_the_mean_loss_of_every_hundred_steps() -> None:
+    samples, config = spheres(0.5), replace(CONFIG, steps=230)
+    training = start(1, SPECS, config, CPU)
+    losses = [step.loss for step in train(samples, training, config)]
+    assert training.losses == pytest.approx([mean(losses[:100]), mean(losses[100:200]), mean(losses[200:])])
+
+
 def test_another_seed_gives_another_network() -> None:
     one, other = (finished(spheres(0.5), replace(CONFIG, steps=1, seed=seed)) for seed in (0, 1))
     assert not torch.equal(one.codes, other.codes)
@@ -264,8 +272,9 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Pa
     assert one["step"] == other["step"] == 120
     assert one["config"] == other["config"]
     assert torch.equal(one["codes"], other["codes"])
+    assert one["losses"] == other["losses"]
     assert_same_state(one["decoder"], other["decoder"])
-    wanted = {"result.json", "specs.json", NAME, "preview.png", "ModelParameters", "LatentCodes"}
+    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "ModelParameters", "LatentCodes"}
     assert {path.name for path in whole.iterdir()} == wanted
     assert load_model(whole).shapes == ("sphere0", "sphere1")
 

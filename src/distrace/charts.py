@@ -3,12 +3,14 @@
 import io
 import re
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from distrace.files import written
 from distrace.page import Html
 
 PALETTE = ("#4477aa", "#ee7733", "#228833", "#cc3377", "#8866cc", "#0099aa", "#aa8811", "#888888")
@@ -49,6 +51,18 @@ def courses(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: 
     chart, axes = _lines(series, markevery=[-1])
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
     return _drawn(chart)
+
+
+def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
+    """A PNG of values, one for each so many steps, on logarithmic axes."""
+    with rc_context({"font.size": 10.5}):
+        chart = Figure(figsize=(7.4, 3.6), layout="constrained")
+        axes = chart.add_subplot()
+        axes.plot(range(every, every * len(values) + 1, every), values, color=PALETTE[0])
+        axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
+        axes.grid(which="both", alpha=0.12)
+        with written(path) as file:
+            chart.savefig(file, format="png", dpi=110)
 
 
 def steps_chart(series: Mapping[str, Mapping[str, float]], x_label: str, y_label: str) -> Html:

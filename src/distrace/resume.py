@@ -17,6 +17,7 @@ def save_training(folder: Path, training: Training, config: TrainConfig, names: 
     """Replaces the run's checkpoint; at no moment is there none."""
     state = {
         "step": training.step,
+        "losses": training.losses,
         "config": asdict(config),
         "specs": asdict(training.decoder.specs),
         "names": names,
@@ -44,7 +45,7 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.decoder.load_state_dict(state["decoder"])
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
-        training.step = state["step"]
+        training.step, training.losses = state["step"], state["losses"]
     if state["names"] != names:
         raise ValueError(
             f"{path} was trained on {len(state['names'])} files of samples, and now there are {len(names)} or others;"

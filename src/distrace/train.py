@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 
 VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+COURSE = 100  # steps, whose mean loss is a point of a run's course
 
 
 @dataclass(frozen=True)
@@ -71,6 +72,15 @@ class Training:
     codes: nn.Parameter  # [shapes, length]
     optimiser: torch.optim.Adam
     step: int = 0
+    losses: list[float] = field(default_factory=list)  # the mean of each COURSE steps so far; the last may have fewer
+
+    def record(self, loss: float) -> None:
+        """Counts a step done."""
+        done = self.step % COURSE
+        if not done:
+            self.losses.append(0.0)
+        self.losses[-1] += (loss - self.losses[-1]) / (done + 1)
+        self.step += 1
 
 
 @dataclass(frozen=True)
@@ -132,8 +142,8 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
         (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
         training.optimiser.step()
         bound_codes(training.codes, config.code_bound)
-        training.step += 1
-        yield Step(training.step, loss.item(), time.perf_counter() - began)
+        training.record(value := loss.item())
+        yield Step(training.step, value, time.perf_counter() - began)
 
 
 def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:

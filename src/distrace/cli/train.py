@@ -9,6 +9,7 @@ import torch
 import tyro
 
 from distrace.bench import poster_view
+from distrace.charts import save_course
 from distrace.checkpoint import Model, save_experiment
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
@@ -19,7 +20,7 @@ from distrace.render import render
 from distrace.report import View
 from distrace.resume import load_training, save_training
 from distrace.shading import save_png, side_by_side
-from distrace.train import Samples, TrainConfig, Training, faster_in_bfloat16, load_samples
+from distrace.train import COURSE, Samples, TrainConfig, Training, faster_in_bfloat16, load_samples
 from distrace.train import start as start_training
 from distrace.train import train as run_training
 
@@ -66,7 +67,8 @@ class Train:
             training = start_training(len(loaded.names), specs, config, run.device)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         loss = _run(run, loaded, training, config, self.save_every)
-        run.finish({"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16})
+        facts = {"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
+        run.finish({**facts, "losses": training.losses})
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""
@@ -120,8 +122,9 @@ def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, sa
 
 
 def _save(run: Run, samples: Samples, training: Training, config: TrainConfig) -> None:
-    """The checkpoint to go on from, the model in DeepSDF's layout, and a look at a few shapes."""
+    """The checkpoint to go on from, the model in DeepSDF's layout, the loss so far, and a look at a few shapes."""
     save_training(run.out, training, config, samples.names)
+    save_course(run.out / "losses.png", training.losses, COURSE, "steps", f"mean loss of {COURSE} steps")
     save_experiment(run.out, training.decoder, training.codes, tuple(samples.names))
     training.decoder.eval()
     codes = training.codes.detach()
