@@ -16,7 +16,7 @@ from test_train import SPECS, of_sphere, spheres
 import distrace.cli
 import distrace.cli.train
 import distrace.movie
-from distrace import training_choices
+from distrace import evaluate, metrics, training_choices
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.data.samples import write_samples
@@ -329,10 +329,13 @@ def test_evaluate_choices_trains_small_networks(
     split, meshes = spheres_split
     run("sample", meshes, "--split", split, "--variants", 1, "--count", 1500, "--workers", 1, "--out", tmp_path / "s")
     monkeypatch.setattr(training_choices, "SPECS", SPECS)
+    monkeypatch.setattr(evaluate, "TOLD", 500)
+    monkeypatch.setattr(metrics, "POINTS", 500)
     where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
-    run("evaluate", "choices", *where, "--steps", 60, "--resolution", 24)
+    run("evaluate", "choices", *where, "--others", tmp_path / "s", "--steps", 60, "--resolution", 24)
     rows = result(tmp_path / "out", "rows")["rows"]
-    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4, 4]
+    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4, 4, 9, 9]
+    assert [row["steps"] for row in rows[-2:]] == [60, 60 * 9 // 4]
     assert all(row["held_out_median"] > 0 for row in rows)
 
 

@@ -9,7 +9,7 @@ from jaxtyping import Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from distrace.field import SDF
+from distrace.field import SDF, narrowed
 
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
 
@@ -35,8 +35,9 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     Normals point out. Raises `ValueError` where the field has no zero in the cube.
     """
     width = 2 * config.radius / config.resolution
-    corners = _corners(_cells_at_surface(sdf, config))
-    values = sdf(corners.float() * width - config.radius).cpu().numpy()
+    cells, near = _cells_at_surface(sdf, config)
+    corners = _corners(cells)
+    values = near(corners.float() * width - config.radius).cpu().numpy()
     if not ((values < 0).any() and (values > 0).any()):
         raise ValueError(f"the field has no zero within {config.radius} of the origin: there is no surface to extract")
     grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
@@ -46,15 +47,20 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     return trimesh.Trimesh(vertices * width - config.radius, faces, process=False)
 
 
-def _cells_at_surface(sdf: SDF, config: MeshConfig) -> Int[Tensor, "n 3"]:
-    """Indices of the finest cells, found by halving those of a coarse grid that |f| at the centre cannot exclude."""
+def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"], SDF]:
+    """Indices of the finest cells, found by halving those of a coarse grid that |f| at the centre cannot exclude.
+
+    With them the same field, where it can be cheaper near its surface.
+    """
     coarse = torch.arange(config.resolution >> LEVELS, device=config.device)
     cells, halves = torch.cartesian_prod(coarse, coarse, coarse), _offsets(config.device)
     for level in range(LEVELS, 0, -1):
         width = 2 * config.radius / config.resolution * 2**level
-        near = sdf((cells + 0.5) * width - config.radius).abs() <= config.steepest * width * 3**0.5 / 2
+        centres = (cells + 0.5) * width - config.radius
+        values, field = narrowed(sdf, centres) if level == 1 else (sdf(centres), sdf)
+        near = values.abs() <= config.steepest * width * 3**0.5 / 2
         cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
-    return cells
+    return cells, field
 
 
 def _corners(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "m 3"]:

@@ -24,6 +24,8 @@ class Choice:
     name: str
     learnt: Callable[[str], bool]  # of a variant: "" of the shape itself, "mirrored", "warped1" …
     config: TrainConfig = TrainConfig()
+    beside: bool = False  # other classes, whose samples are learnt, too
+    visits: bool = False  # and as often a shape, by more steps
 
 
 @dataclass(frozen=True)
@@ -48,15 +50,26 @@ CHOICES = [
         "… wrong signs and large errors counted more", lambda variant: True, TrainConfig(wrong_sign=4.0, large=0.01)
     ),
     Choice("… codes held ten times tighter", lambda variant: True, TrainConfig(code_penalty=1e-3)),
+    Choice("… beside other classes", lambda variant: True, beside=True),
+    Choice("… beside other classes, each shape seen as often", lambda variant: True, beside=True, visits=True),
 ]
 
 
+def choices_with(others: Sequence[Path]) -> list[Choice]:
+    """Those that can be tried."""
+    return [choice for choice in CHOICES if others or not choice.beside]
+
+
 def choice_rows(
-    samples: Path, split: str, meshes: Path, steps: int, resolution: int, choices: Sequence[Choice] = CHOICES
+    samples: Path, split: str, meshes: Path, steps: int, resolution: int, others: Sequence[Path] = ()
 ) -> Iterator[ChoiceRow]:
-    """Each choice with as many steps. Raises `ValueError` for missing samples or meshes."""
+    """Each choice with as many steps; `others` are folders of samples of other classes.
+
+    Raises `ValueError` for missing samples or meshes.
+    """
     learnt, held_out = (on_side(side, split) for side in ("train", "test"))
-    for choice in choices:
+    company = [path for folder in others for path in sorted(folder.glob("*.npz"))]
+    for choice in choices_with(others):
         paths = [
             path
             for shape in learnt
@@ -65,12 +78,14 @@ def choice_rows(
         ]
         if not paths:
             raise ValueError(f"{samples} holds no samples of {split}; `distrace sample --split {split}` makes them")
-        model = _trained(paths, replace(choice.config, steps=steps))
+        everything = paths + company if choice.beside else paths
+        taken = steps * len(everything) // len(paths) if choice.visits else steps
+        model = _trained(everything, replace(choice.config, steps=taken))
         known = [shape for shape in learnt if shape.name in model.shapes]
         shown = known[:: max(len(known) // SHOWN, 1)]
         told = [result.chamfer for result in training_results(model, shown, meshes, resolution)]
         unseen = [result.chamfer for result in held_out_results(model, held_out, meshes, resolution)]
-        yield ChoiceRow(choice.name, len(paths), steps, mean(told), median(unseen), mean(unseen))
+        yield ChoiceRow(choice.name, len(everything), taken, mean(told), median(unseen), mean(unseen))
 
 
 def _trained(paths: list[Path], config: TrainConfig) -> Model:

@@ -10,7 +10,7 @@ from distrace.data.split import CLASSES, read_split
 from distrace.files import save_json, save_text
 from distrace.shading import save_png
 from distrace.split_table import nearest_rows, used
-from distrace.training_choices import CHOICES, choice_rows
+from distrace.training_choices import choice_rows, choices_with
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,7 @@ class Choices:
 
     samples: Path = Path("out/samples")  # of the split, with `--mirror --variants 4`
     split: str = "chairs"
+    others: tuple[Path, ...] = ()  # folders of samples of other classes, for two choices more
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     steps: int = 6000  # of each
@@ -45,8 +46,9 @@ class Choices:
 
     def run(self) -> None:
         run, rows = start(self.out), []
-        with progress("choices", len(CHOICES)) as bar:
-            for row in choice_rows(self.samples, self.split, self.meshes, self.steps, self.resolution):
+        tried = choice_rows(self.samples, self.split, self.meshes, self.steps, self.resolution, self.others)
+        with progress("choices", len(choices_with(self.others))) as bar:
+            for row in tried:
                 rows.append(asdict(row))
                 save_json(run.out / "rows.json", rows)
                 bar.advance(f"{row.choice}: {row.held_out_median:.2f}")
