@@ -67,7 +67,16 @@ def test_cells_are_passed_over_only_where_there_is_no_surface() -> None:
     assert asked < 65**3 / 4
 
 
-def test_a_larger_cube_holds_a_larger_shape() -> None:
+def test_what_is_beyond_the_ball_is_no_part_of_the_shape() -> None:
+    """There a decoder was never trained, and no ray is marched."""
+    corner, edge = (primitives.sphere(0.2, torch.tensor(3 * [middle])) for middle in (0.8, -0.55))
+    mesh = extract_mesh(primitives.union(primitives.union(primitives.sphere(0.4), corner), edge), COARSE)
+    assert mesh.is_watertight
+    assert np.linalg.norm(mesh.vertices, axis=1).max() < 1 + 1 / 48
+    assert len(mesh.split()) == 2
+
+
+def test_a_larger_ball_holds_a_larger_shape() -> None:
     mesh = extract_mesh(primitives.sphere(1.5), MeshConfig(resolution=48, radius=2.0))
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 1.5**3, rel=1e-2)
 

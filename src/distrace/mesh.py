@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import trimesh
-from jaxtyping import Int
+from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
@@ -16,10 +16,10 @@ LEVELS = 3  # cells are halved this often, and only those kept that can hold the
 
 @dataclass(frozen=True)
 class MeshConfig:
-    """A grid of `resolution` cells (a multiple of 8) along each axis of the cube of half width `radius`."""
+    """A grid of `resolution` cells (a multiple of 8) along each axis of the cube around the ball of this radius."""
 
     resolution: int = 256
-    radius: float = 1.0
+    radius: float = 1.0  # beyond, where decoders were never trained and rays are not marched, is outside
     steepest: float = 1.5  # a bound on |∇f|: a cell farther from zero than this over half its diagonal is passed over
     device: torch.device = torch.device("cpu")
 
@@ -37,9 +37,11 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     width = 2 * config.radius / config.resolution
     cells, near = _cells_at_surface(sdf, config)
     corners = _corners(cells)
-    values = near(corners.float() * width - config.radius).cpu().numpy()
-    if not ((values < 0).any() and (values > 0).any()):
+    points = corners.float() * width - config.radius
+    found = near(points)
+    if not ((found < 0).any() and (found > 0).any()):
         raise ValueError(f"the field has no zero within {config.radius} of the origin: there is no surface to extract")
+    values = _in_ball(found, points, config.radius).cpu().numpy()
     grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
     grid[tuple(corners.cpu().numpy().T)] = values
     known = np.isfinite(grid)
@@ -58,9 +60,14 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
         width = 2 * config.radius / config.resolution * 2**level
         centres = (cells + 0.5) * width - config.radius
         values, field = narrowed(sdf, centres) if level == 1 else (sdf(centres), sdf)
-        near = values.abs() <= config.steepest * width * 3**0.5 / 2
+        near = _in_ball(values, centres, config.radius).abs() <= config.steepest * width * 3**0.5 / 2
         cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
     return cells, field
+
+
+def _in_ball(values: Float[Tensor, "n"], points: Float[Tensor, "n 3"], radius: float) -> Float[Tensor, "n"]:
+    """What is common to the shape and the ball."""
+    return values.maximum(points.norm(dim=1) - radius)
 
 
 def _corners(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "m 3"]:
