@@ -199,7 +199,7 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
 
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
-    options = ("--points", 50, "--iterations", 30, "--starts", 2, "--resolution", 16)
+    options = ("--points", 50, "--solver", "adam", "--iterations", 30, "--starts", 2, "--resolution", 16)
     run("complete", model, observation, "--reference", tmp_path / "true.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
     assert names(out) == {"result.json", "mesh.ply", "code.npy", "report.html", "shaded.png"}
@@ -348,7 +348,7 @@ def test_complete_in_a_few_iterations_still_ends_with_a_code(
 
 
 def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
-    run("complete", model, observation, "--solver", "lm", "--starts", 2, "--resolution", 16, "--out", tmp_path)
+    run("complete", model, observation, "--starts", 2, "--resolution", 16, "--out", tmp_path)
     fitted = load_model(model).field(torch.from_numpy(np.load(tmp_path / "code.npy")))
     surface = 0.6 * torch.nn.functional.normalize(
         torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=1

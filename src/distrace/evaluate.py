@@ -16,7 +16,6 @@ from distrace.data.samples import sample
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape
 from distrace.data.view import observe
-from distrace.fit import FitConfig
 from distrace.fit_code import CodeFitConfig, fit_points
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
@@ -80,7 +79,7 @@ def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
 
 
 def completion_results(
-    model: Model, shapes: list[Shape], meshes: Path, points: int, config: FitConfig, resolution: int
+    model: Model, shapes: list[Shape], meshes: Path, points: int, config: CodeFitConfig, resolution: int
 ) -> Iterator[Result]:
     """Each held-out shape completed from `points` depths of one view, by each method."""
     for shape in shapes:

@@ -33,8 +33,8 @@ class Complete:
     reference: Path | None = None  # the true surface, to measure against: a mesh or points (PLY)
     points: int | None = None  # use only so many of the depths or points, drawn at random
     ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
-    solver: Literal["adam", "lm"] = "adam"  # lm: Levenberg–Marquardt, in a fraction of the time; points have no other
-    iterations: int | None = None  # by default 150 of Adam, or 16 of Levenberg–Marquardt
+    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or the original's Adam; points have no other than lm
+    iterations: int | None = None  # by default 16 of Levenberg–Marquardt, or 150 of Adam
     starts: int = FitConfig.starts
     plausible: int = 0  # so many other completions that fit, too, and how far they are apart
     seed: int = 0
@@ -72,7 +72,7 @@ class Demo:
         truth = _reference(Path(str(OBSERVATIONS / f"{name}.ply")))
         console.print(f"completing [bold]{name}[/bold] from {DEMO_POINTS} depths and its silhouette")
         known = full.sparse(DEMO_POINTS, self.seed).without("normal")
-        fit, mesh = FitConfig(seed=self.seed), MeshConfig(128, device=run.device)
+        fit, mesh = CodeFitConfig(seed=self.seed), MeshConfig(128, device=run.device)
         complete(run, Task(opened("sofas", run.device), full, known, truth, fit, mesh))
 
 

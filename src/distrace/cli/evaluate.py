@@ -23,7 +23,7 @@ from distrace.evaluate import (
     training_results,
 )
 from distrace.files import save_json, save_text
-from distrace.fit import FitConfig
+from distrace.fit_code import CodeFitConfig
 from distrace.methods import METHODS
 from distrace.page import figure, page, section, table
 from distrace.trials import each_done
@@ -68,13 +68,13 @@ class HeldOut(_OfSplit):
 
 @dataclass(frozen=True)
 class Completion(_OfSplit):
-    """Held-out shapes completed from some depths of one view, by DeepSDF and by Adam on renderings."""
+    """Held-out shapes completed from some depths of one view, by DeepSDF and by ours."""
 
     points: int = 100  # observed depths
     seed: int = 0
 
     def run(self) -> None:
-        results = partial(completion_results, points=self.points, config=FitConfig(seed=self.seed))
+        results = partial(completion_results, points=self.points, config=CodeFitConfig(seed=self.seed))
         self._run("completion", "test", results, len(METHODS))
 
 
