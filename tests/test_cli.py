@@ -501,6 +501,8 @@ BAD = [
     ("evaluate completion --model {model} --split {tmp}/missing", "there is no split"),
     ("evaluate fame --model {model}", "fame"),
     ("evaluate sparse-depth --views 5", "--views 5"),
+    ("evaluate sparse-depth --shapes 0", "--shapes 0"),
+    ("evaluate spread --jobs 0", "--jobs 0"),
     ("evaluate noise --models {model}", "1 models"),
     ("evaluate sparse-depth --classes {tmp}/missing", "there is no split"),
     ("evaluate splits --splits {tmp}/missing", "there is no split"),

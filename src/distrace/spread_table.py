@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
-from distrace.data.split import on_side
+from distrace.data.split import Shape
 from distrace.data.view import observe
 from distrace.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
@@ -38,10 +38,9 @@ class SpreadRow:
     seconds: float  # of all completions
 
 
-def spread_rows(category: str, model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
-    """Each held-out shape of a split."""
-    names = [shape.name for shape in on_side("test", category)]
-    return each_done(partial(_row, category, model, meshes), names, jobs)
+def spread_rows(category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
+    """Each of the shapes of a split."""
+    return each_done(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:

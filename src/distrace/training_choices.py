@@ -11,8 +11,9 @@ from distrace.checkpoint import Model
 from distrace.data.split import on_side
 from distrace.decoder import NetworkSpecs
 from distrace.evaluate import held_out_results, training_results
-from distrace.train import TrainConfig, load_samples, start, train
+from distrace.train import TrainConfig, faster_in_bfloat16, load_samples, start, train
 
+CPU = torch.device("cpu")
 SPECS = NetworkSpecs((256,) * 8)
 SHOWN = 10  # training shapes that are compared
 
@@ -68,6 +69,7 @@ def choice_rows(
     Raises `ValueError` for missing samples or meshes.
     """
     learnt, held_out = (on_side(side, split) for side in ("train", "test"))
+    bfloat16 = faster_in_bfloat16(SPECS, CPU)
     company = [path for folder in others for path in sorted(folder.glob("*.npz"))]
     for choice in choices_with(others):
         paths = [
@@ -80,7 +82,7 @@ def choice_rows(
             raise ValueError(f"{samples} holds no samples of {split}; `distrace sample --split {split}` makes them")
         everything = paths + company if choice.beside else paths
         taken = steps * len(everything) // len(paths) if choice.visits else steps
-        model = _trained(everything, replace(choice.config, steps=taken))
+        model = _trained(everything, replace(choice.config, steps=taken, bfloat16=bfloat16))
         known = [shape for shape in learnt if shape.name in model.shapes]
         shown = known[:: max(len(known) // SHOWN, 1)]
         told = [result.chamfer for result in training_results(model, shown, meshes, resolution)]
@@ -90,7 +92,7 @@ def choice_rows(
 
 def _trained(paths: list[Path], config: TrainConfig) -> Model:
     loaded = load_samples(paths)
-    training = start(len(paths), SPECS, config, torch.device("cpu"))
+    training = start(len(paths), SPECS, config, CPU)
     for _ in train(loaded, training, config):
         pass
     training.decoder.eval().requires_grad_(False)

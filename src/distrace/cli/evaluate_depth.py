@@ -9,11 +9,11 @@ from statistics import median
 from distrace import depth_tables
 from distrace.cli.common import Meshes, show_table
 from distrace.cli.console import console, origin, progress, start
-from distrace.data.split import CLASSES, on_side
+from distrace.data.split import CLASSES
 from distrace.files import save_text
 from distrace.focal_test import look_rows, looks
 from distrace.methods import METHODS
-from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done
+from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
 from distrace.spread_table import spread_rows
 from distrace.trials import each_done
 
@@ -32,9 +32,7 @@ class _DepthTable:
 
     def _run(self, name: str, more: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
         """Each trial leaves a file in `trials`; what is there already is not done again. `more` facts may follow."""
-        if self.jobs < 1 or not 1 <= self.views <= len(AZIMUTHS_ELEVATIONS) or (self.shapes or 1) < 1:
-            given = f"--jobs {self.jobs} --views {self.views} --shapes {self.shapes}"
-            raise ValueError(f"{given} was given; at least 1 of each are needed, and at most 4 views")
+        checked(self.jobs, self.shapes, self.views)
         run, models = start(self.out), paired(self.classes, self.models)
         place = Place(self.meshes, run.out, models, self.resolution)
         trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
@@ -99,21 +97,31 @@ class Spread:
 
     classes: tuple[str, ...] = CLASSES
     models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    shapes: int | None = None  # held-out ones of each class; by default all
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
 
     def run(self) -> None:
+        checked(self.jobs, self.shapes)
         run, rows = start(self.out), []
-        with progress("spread", sum(len(on_side("test", category)) for category in self.classes)) as bar:
+        chosen = {category: held_out(category, self.shapes) for category in self.classes}
+        with progress("spread", sum(map(len, chosen.values()))) as bar:
             for category, model in paired(self.classes, self.models):
-                for row in spread_rows(category, model, self.meshes, self.jobs):
+                for row in spread_rows(category, chosen[category], model, self.meshes, self.jobs):
                     rows.append(asdict(row))
                     bar.advance(f"{row.shape}: {row.correlation:.2f}")
         show_table(rows)
         middle = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
         console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in middle.items()))
         run.finish({"rows": rows, "median_correlation": middle, **origin()})
+
+
+def checked(jobs: int, shapes: int | None, views: int = 1) -> None:
+    """Raises `ValueError` for numbers that make no table."""
+    if jobs < 1 or not 1 <= views <= len(AZIMUTHS_ELEVATIONS) or (shapes is not None and shapes < 1):
+        given = f"--jobs {jobs} --views {views}" + ("" if shapes is None else f" --shapes {shapes}")
+        raise ValueError(f"{given} were given; at least 1 of each are needed, and at most 4 views")
 
 
 def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, str], ...]:
