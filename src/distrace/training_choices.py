@@ -14,7 +14,7 @@ from distrace.evaluate import held_out_results, training_results
 from distrace.train import TrainConfig, faster_in_bfloat16, load_samples, start, train
 
 CPU = torch.device("cpu")
-SPECS = NetworkSpecs((256,) * 8)
+SPECS = NetworkSpecs((256,) * 8, code_length=128)
 SHOWN = 10  # training shapes that are compared
 
 
