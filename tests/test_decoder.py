@@ -1,5 +1,7 @@
 """The decoder, against DeepSDF's forward pass written out in numpy (Park et al., CVPR 2019, and their own code)."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -270,3 +272,18 @@ def test_a_code_of_another_length_is_named():
 def test_a_network_without_room_is_refused(specs, complaint):
     with pytest.raises(ValueError, match=complaint + ".* each must be at least 1$"):
         Decoder(specs)
+
+
+@pytest.mark.parametrize("layer", [0, 1], ids=["fed first", "fed again"])
+def test_points_keep_their_precision_under_autocast(layer: int) -> None:
+    """In bfloat16 0.8004 is 0.8008: thinner parts could not be learnt."""
+    decoder = Decoder(NetworkSpecs((5,), code_length=1, latent_in=(1,), norm_layers=()))
+    steep = getattr(decoder, f"lin{layer}")
+    with torch.no_grad():
+        for parameter in decoder.parameters():
+            parameter.zero_()
+        steep.weight[0, -3], steep.bias[0] = 1000.0, -800.0
+        decoder.lin1.weight[0, 0] = 1.0
+        with torch.autocast("cpu", torch.bfloat16):
+            value = decoder(torch.tensor([[0.8004, 0.0, 0.0]]), torch.zeros(1, 1))
+    assert value.item() == pytest.approx(math.tanh(0.4), abs=0.005)
