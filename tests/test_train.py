@@ -152,6 +152,19 @@ def test_a_run_keeps_the_mean_loss_of_every_hundred_steps() -> None:
     assert training.losses == pytest.approx([mean(losses[:100]), mean(losses[100:200]), mean(losses[200:])])
 
 
+def test_a_run_of_a_version_that_kept_no_losses_goes_on(tmp_path: Path) -> None:
+    samples, config = spheres(0.5), replace(CONFIG, steps=130)
+    first = start(1, SPECS, config, CPU)
+    for _ in islice(train(samples, first, config), 120):
+        pass
+    save_training(tmp_path, first, config, samples.names)
+    torch.save({name: value for name, value in checkpoint(tmp_path).items() if name != "losses"}, tmp_path / NAME)
+    loaded = load_training(tmp_path, samples.names, CPU)
+    assert loaded is not None
+    assert [step.step for step in train(samples, *loaded)] == list(range(121, 131))
+    assert len(loaded[0].losses) == 2
+
+
 def test_another_seed_gives_another_network() -> None:
     one, other = (finished(spheres(0.5), replace(CONFIG, steps=1, seed=seed)) for seed in (0, 1))
     assert not torch.equal(one.codes, other.codes)

@@ -105,10 +105,8 @@ class Decoder(nn.Module):
     def _run(self, layers: list[Layer], points: Tensor, watch: Callable[[int, Tensor], None] | None = None) -> Tensor:
         x = points[..., :0]
         for layer, (weight, bias) in enumerate(layers):
-            if not layer or layer in self.specs.latent_in or self.specs.xyz_in_all:
-                x = _joined(x, points, weight, bias)
-            else:
-                x = F.linear(x, weight, bias) if bias.dim() == 1 else F.linear(x, weight) + bias
+            fed = not layer or layer in self.specs.latent_in or self.specs.xyz_in_all
+            x = _joined(x, points, weight, bias) if fed else _linear(x, weight, bias)
             if layer < self.depth - 1:
                 if watch:
                     watch(layer, x)
@@ -165,11 +163,15 @@ class ShapeField:
         return (weight[kept[layer]], bias[kept[layer]]) if layer < len(kept) else (weight.contiguous(), bias)
 
 
+def _linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+    """A layer; its bias is one for all points, or one for each shape of a batch."""
+    return F.linear(x, weight, bias) if bias.dim() == 1 else F.linear(x, weight) + bias
+
+
 def _joined(units: Tensor, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """A layer of units and points, the latter in full precision also under autocast."""
     if not torch.is_autocast_enabled(points.device.type):
-        x = torch.cat([units, points], dim=-1)
-        return F.linear(x, weight, bias) if bias.dim() == 1 else F.linear(x, weight) + bias
+        return _linear(torch.cat([units, points], dim=-1), weight, bias)
     with torch.autocast(points.device.type, enabled=False):
         placed = (F.linear(points, weight[:, -3:]) + bias).to(torch.get_autocast_dtype(points.device.type))
     return F.linear(units, weight[:, :-3]) + placed if units.shape[-1] else placed

@@ -1,5 +1,6 @@
 """A training run on disk: everything needed to go on as if it had not been stopped, in one file."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 
@@ -8,7 +9,7 @@ import torch
 from distrace.decoder import NetworkSpecs
 from distrace.errors import explained
 from distrace.files import written
-from distrace.train import TrainConfig, Training, start
+from distrace.train import COURSE, TrainConfig, Training, start
 
 NAME = "checkpoint.pt"
 
@@ -45,7 +46,9 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.decoder.load_state_dict(state["decoder"])
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
-        training.step, training.losses = state["step"], state["losses"]
+        training.step = state["step"]
+        unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
+        training.losses = state.get("losses", unknown)
     if state["names"] != names:
         raise ValueError(
             f"{path} was trained on {len(state['names'])} files of samples, and now there are {len(names)} or others;"
