@@ -17,12 +17,23 @@ import torch
 from torch import Tensor
 
 import distrace.cli.train
-from distrace.checkpoint import load_model, save_experiment
+from distrace.checkpoint import load_model, save_experiment, save_model
 from distrace.cli import main
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.resume import NAME, load_training, save_training
-from distrace.train import Samples, TrainConfig, Training, bound_codes, draw, load_samples, start, train, training_loss
+from distrace.train import (
+    Samples,
+    TrainConfig,
+    Training,
+    begin_with,
+    bound_codes,
+    draw,
+    load_samples,
+    start,
+    train,
+    training_loss,
+)
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
@@ -194,6 +205,32 @@ def test_a_trained_folder_opens_as_a_model(tmp_path: Path) -> None:
     with torch.no_grad():
         for number, code in enumerate(training.codes):
             torch.testing.assert_close(model.field(number)(points), training.decoder.field(code)(points))
+
+
+def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> None:
+    first = finished(samples := spheres(0.3, 0.6), CONFIG)
+    save_experiment(tmp_path / "trained", first.decoder, first.codes, tuple(samples.names))
+    save_model(tmp_path / "bundled", model := load_model(tmp_path / "trained"))  # without weight norm
+    points = samples.outside[0][:50, :3]
+    for name in ("trained", "bundled"):
+        second = start(3, SPECS, CONFIG, CPU)
+        begin_with(second, ["sphere1", "new", "sphere0"], load_model(tmp_path / name))
+        assert_close = torch.testing.assert_close
+        assert_close(second.codes[[2, 0]].detach(), model.codes, rtol=1e-3, atol=1e-3)
+        assert_close(second.codes[1].detach(), model.codes.mean(0), rtol=1e-3, atol=1e-3)
+        with torch.no_grad():
+            values = second.decoder.eval().field(model.codes[0])(points)
+            assert_close(values, model.field(0)(points), rtol=1e-2, atol=1e-3)
+        before = second.decoder.lin0.parametrizations.weight.original1.clone()
+        next(train(spheres(0.3, 0.4, 0.6), second, replace(CONFIG, warm_up=1)))
+        assert not torch.equal(before, second.decoder.lin0.parametrizations.weight.original1), "the optimiser has it"
+
+
+def test_a_folder_is_learnt_from_a_model_of_another_size(tmp_path: Path, run) -> None:
+    samples, first = sample_files(tmp_path / "samples", 0.5), tmp_path / "first"
+    run("train", samples, "--out", first, *TINY[2:], "--steps", "3")
+    run("train", samples, "--out", tmp_path / "second", "--begin-with", first, "--steps", "1")
+    assert load_model(tmp_path / "second").decoder.specs.dims == (16, 16, 16)
 
 
 def test_there_is_no_run_to_go_on_with_in_an_empty_folder(tmp_path: Path) -> None:

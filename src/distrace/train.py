@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.utils.parametrize import is_parametrized
 
+from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 
@@ -119,6 +121,20 @@ def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.d
         {"params": [codes], "peak": config.code_learning_rate},
     ]
     return Training(decoder, codes, torch.optim.Adam(groups, lr=0.0, fused=True))
+
+
+@torch.no_grad()
+def begin_with(training: Training, names: list[str], model: Model) -> None:
+    """Takes over a model's network, and its codes of shapes of the same names; the other shapes begin at their mean."""
+    for layer in range(training.decoder.depth):
+        own, learnt = (getattr(decoder, f"lin{layer}") for decoder in (training.decoder, model.decoder))
+        if is_parametrized(own, "weight"):
+            own.weight = learnt.weight.detach()  # weight norm takes it apart
+        else:
+            own.weight.copy_(learnt.weight)
+        own.bias.copy_(learnt.bias)
+    known = {shape: code for shape, code in zip(model.shapes, model.codes, strict=True)}
+    training.codes.copy_(torch.stack([known.get(name, model.codes.mean(0)) for name in names]))
 
 
 def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator[Step]:

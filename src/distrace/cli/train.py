@@ -11,6 +11,7 @@ import tyro
 from distrace.bench import poster_view
 from distrace.charts import save_course
 from distrace.checkpoint import Model, save_experiment
+from distrace.cli.common import opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
 from distrace.data import sampling
@@ -20,7 +21,7 @@ from distrace.render import render
 from distrace.report import View
 from distrace.resume import load_training, save_training
 from distrace.shading import save_png, side_by_side
-from distrace.train import COURSE, Samples, TrainConfig, Training, faster_in_bfloat16, load_samples
+from distrace.train import COURSE, Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
 from distrace.train import start as start_training
 from distrace.train import train as run_training
 
@@ -44,6 +45,7 @@ class Train:
     layers: int = 8
     width: int = 512
     code_length: int = 256
+    begin_with: str | None = None  # a model, bundled or in a folder, whose network and codes are learnt further
     seed: int = 0
     save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
     device: str = "cpu"
@@ -59,16 +61,27 @@ class Train:
             config = self._changed(config)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
-            specs = NetworkSpecs(
-                (self.width,) * self.layers, self.code_length, (self.layers // 2,), tuple(range(self.layers))
-            )
+            known = None if self.begin_with is None else opened(self.begin_with, run.device)
+            specs = self._specs(known)
             config = self._changed(TrainConfig(samples_per_step=self.samples_per_step, seed=self.seed))
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
             training = start_training(len(loaded.names), specs, config, run.device)
+            if known is not None:
+                begin_with(training, loaded.names, known)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         loss = _run(run, loaded, training, config, self.save_every)
         facts = {"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
+
+    def _specs(self, known: Model | None) -> NetworkSpecs:
+        """With weight norm, as DeepSDF has it; of a model's size if there is one."""
+        if known is None:
+            sizes = (self.width,) * self.layers, self.code_length, (self.layers // 2,)
+            return NetworkSpecs(*sizes, norm_layers=tuple(range(self.layers)))
+        specs = known.decoder.specs
+        if specs.norm_layers and not specs.weight_norm:
+            raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
+        return replace(specs, norm_layers=tuple(range(len(specs.dims))), weight_norm=True)
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""
