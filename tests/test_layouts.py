@@ -9,8 +9,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from photographed import (
+    SIZES,
+    WORLD,
+    ball,
+    cameras,
+    colours,
+    cut,
+    in_world,
+    reads_back,
+    refused,
+    write_images,
+    write_masks,
+)
 from PIL import Image
-from photographed import SIZES, WORLD, ball, cameras, colours, cut, in_world, reads_back, refused, write_images, write_masks
 
 from distrace.camera import Camera
 from distrace.data.layouts.idr import decomposed
@@ -80,7 +92,9 @@ def test_what_is_told_for_all_frames_holds_for_each_and_masks_are_read(tmp_path:
     write_masks(tmp_path / "masks")
     loaded = load_photographs(frames(tmp_path, common))
     assert [view.camera.intrinsics[0, 0].item() for view in loaded.views] == [32.0, 32.0]
-    assert all(view.mask is not None and torch.equal(view.mask, ball(cameras()[2 * k])) for k, view in enumerate(loaded.views))
+    for view, camera in zip(loaded.views, cameras()[::2]):
+        assert view.mask is not None
+        assert torch.equal(view.mask, ball(camera))
 
 
 def frame(**values: object) -> Callable[[dict], object]:
@@ -91,7 +105,10 @@ SCALED = np.diag([3.0, 3, 3, 1]).tolist()
 FRAMES = {
     "distorted": (frame(k1=0.1), ("frames[1]", "k1 is 0.1", "undistort")),
     "all distorted": (lambda content: content.update(p1=-0.01), ("frames[0]", "p1 is -0.01", "undistort")),
-    "fisheye": (lambda content: content.update(camera_model="OPENCV_FISHEYE"), ("camera_model", "FISHEYE", "undistort")),
+    "fisheye": (
+        lambda content: content.update(camera_model="OPENCV_FISHEYE"),
+        ("camera_model", "FISHEYE", "undistort"),
+    ),
     "no image": (frame(file_path="images/none"), ("frames[1]", "file_path names images/none")),
     "outside": (frame(file_path="images/../../x.png"), ("frames[1]", "file_path", "leaves")),
     "no mask": (frame(mask_path="masks/1.png"), ("frames[1]", "mask_path names masks/1.png")),
@@ -170,12 +187,13 @@ def test_what_is_wrong_with_a_model_is_told(tmp_path: Path) -> None:
     refused(tmp_path / "mask", "image view3.png", "neither view3.png.png nor view3.png")
 
 
-@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
-@pytest.mark.parametrize("length", [0, 4, 70])
-def test_models_that_are_cut_off_are_told(tmp_path: Path, name: str, length: int) -> None:
-    model(tmp_path, "binary")
-    cut(tmp_path / "sparse/0" / name, length)
-    refused(tmp_path, "sparse/0")
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_models_that_are_cut_off_or_longer_are_told(tmp_path: Path, name: str) -> None:
+    path = model(tmp_path, "binary") / "sparse/0" / name
+    whole = path.read_bytes()
+    for content in (b"", whole[:4], whole[:37], whole[:-1], whole + b"0", b"\xff" * 300):
+        path.write_bytes(content)
+        refused(tmp_path, f"sparse/0/{name} is cut off or damaged")
 
 
 def test_a_model_without_its_images_is_told(tmp_path: Path) -> None:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from photographed import (
     POINT,
     SIZES,
@@ -23,6 +22,7 @@ from photographed import (
     write_images,
     write_masks,
 )
+from PIL import Image
 
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes, save_photographs
 from distrace.rays import meet_sphere

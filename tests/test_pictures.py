@@ -76,7 +76,7 @@ def test_exif_leaves_the_image_as_it_is_stored(tmp_path: Path) -> None:
 
 
 def test_a_mask_of_ones_in_255_is_told_and_an_empty_one_is_one(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="a.png is nowhere brighter than 1 of 255"):
+    with pytest.raises(ValueError, match=r"a\.png is nowhere brighter than 1 of 255"):
         read_mask(stored(tmp_path, (LEVELS[..., 0] > 60).astype(np.uint8)))
     assert not read_mask(stored(tmp_path, np.zeros((4, 4), np.uint8))).any()
 
@@ -85,6 +85,6 @@ def test_what_is_no_image_is_told_in_one_sentence(tmp_path: Path) -> None:
     whole = stored(tmp_path, np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).read_bytes()
     for content in (b"", b"no image", whole[:2000], whole[:20]):
         (tmp_path / "bad.png").write_bytes(content)
-        with pytest.raises(ValueError, match="bad.png cannot be read as a PNG or JPEG image") as caught:
+        with pytest.raises(ValueError, match=r"bad\.png cannot be read as a PNG or JPEG image") as caught:
             read_picture(tmp_path / "bad.png")
         assert "\n" not in str(caught.value)

@@ -78,7 +78,7 @@ def test_points_tell_the_sphere_although_some_are_far_away() -> None:
     drawn = np.random.default_rng(0)
     ball_points = drawn.normal(size=(500, 3))
     ball_points *= 2 * drawn.random((500, 1)) ** (1 / 3) / np.linalg.norm(ball_points, axis=1, keepdims=True)
-    points = np.concatenate([ball_points + [1, 2, 3], drawn.normal(size=(25, 3)) * 100])
+    points = np.concatenate([ball_points + np.arange(1, 4), drawn.normal(size=(25, 3)) * 100])
     placement = among_points(points)
     assert placement is not None
     assert (placement.centre - torch.tensor([1.0, 2, 3])).norm() < 0.3

@@ -12,12 +12,14 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.placement import TELL, Placement, nearest_to_rays, origins_of
+from distrace.neighbours import thinned
 
 CELLS = 40  # along each axis
 ROUNDS = 3
 START = 1.5  # radii: what surely holds the object
 MARGIN = 1.03
 AGREE = 0.9  # of the masks that see a place: one in ten may be wrong
+MOST = 20_000  # pixels of a mask that are looked at for the start
 SEEN = 0.5  # of the views, at least, see what is the object
 
 
@@ -40,7 +42,7 @@ def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]
 
 def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
     """About where the rays of the masks' middles meet, as large as the mask that reaches farthest from there."""
-    seen = [camera.rays(camera.pixels()[mask]).directions for camera, mask in zip(cameras, masks)]
+    seen = [camera.rays(camera.pixels()[thinned(mask, MOST)]).directions for camera, mask in zip(cameras, masks)]
     middles = torch.stack([directions.mean(0) for directions in seen]).double()
     origins = origins_of(cameras)
     centre = nearest_to_rays(origins, middles / middles.norm(dim=-1, keepdim=True))

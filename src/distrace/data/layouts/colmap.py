@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from distrace.data.layouts.colmap_files import check_whole
 from distrace.data.layouts.shots import Shot, Shots, inside
 from distrace.errors import about, explained
 
@@ -23,21 +24,13 @@ def read(folder: Path) -> Shots | None:
     model = next((place for place in places for kind in ("bin", "txt") if (place / f"cameras.{kind}").is_file()), None)
     if model is None:
         return None
+    check_whole(model)
     from pycolmap import Reconstruction  # here, as loading it takes longer than reading most folders
 
     with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
         found = Reconstruction(model)
-    _check_length(model, found)
     placed = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
     return Shots("COLMAP", tuple(_shot(folder, model, image) for image in placed), points=_points(found))
-
-
-def _check_length(model: Path, found: Any) -> None:
-    """COLMAP reads a cut-off list of cameras without a word, and makes up what is missing."""
-    path = model / "cameras.bin"
-    expected = 8 + sum(24 + 8 * len(camera.params) for camera in found.cameras.values())
-    if path.is_file() and path.stat().st_size != expected:
-        raise ValueError(f"{path} is {path.stat().st_size} bytes long, not {expected}; it is cut off or damaged")
 
 
 def _shot(folder: Path, model: Path, image: Any) -> Shot:
