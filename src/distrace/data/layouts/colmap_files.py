@@ -24,7 +24,7 @@ def _whole(content: bytes, step: Step) -> bool:
         at = 8
         for _ in range(_count(content, 0)):
             at = step(content, at)
-    except (error, ValueError):  # beyond the end; a name without one
+    except (error, ValueError, OverflowError):  # beyond the end; a name without one
         return False
     return at == len(content)
 
