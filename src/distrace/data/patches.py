@@ -51,7 +51,7 @@ def load_patches(path: Path) -> list[Patch]:
 def has_images(patches: Sequence[Patch]) -> bool:
     """Whether enough of a mesh is under images to tell its places apart by."""
     own = sum(patch.area for patch in patches if patch.image is not None)
-    return own > ENOUGH * sum(patch.area for patch in patches)
+    return bool(own > ENOUGH * sum(patch.area for patch in patches))
 
 
 def placed(patches: Sequence[Patch], degrees: float) -> list[Patch]:
@@ -100,7 +100,16 @@ def _of_geometry(mesh: Any) -> Patch:
 
 def _of_ac3d(path: Path) -> list[Patch]:
     colours, found = load_surfaces(path)
-    return [patch for surfaces in found for patch in _of_surfaces(surfaces, colours, path.parent)]
+    images = sorted({surfaces.image for surfaces in found})
+    alike = [_joined([surfaces for surfaces in found if surfaces.image == image]) for image in images]
+    return [patch for surfaces in alike for patch in _of_surfaces(surfaces, colours, path.parent)]
+
+
+def _joined(parts: Sequence[Surfaces]) -> Surfaces:
+    corners, uv, material = (
+        np.concatenate([getattr(part, name) for part in parts]) for name in ("corners", "uv", "material")
+    )
+    return Surfaces(corners, uv, material, parts[0].image)
 
 
 def _of_surfaces(surfaces: Surfaces, colours: Float[np.ndarray, "materials 3"], folder: Path) -> Iterator[Patch]:
@@ -127,4 +136,4 @@ def _mean(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
 
 
 def _pixels(image: Any) -> UInt8[np.ndarray, "height width 3"]:
-    return np.asarray(image.convert("RGB"))
+    return np.asarray(image.convert("RGBA").convert("RGB"))  # by way of RGBA: some palettes have transparent colours
