@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_furniture import write_deb
 
-from distrace.data.ac3d import load_ac3d
+from distrace.data.ac3d import load_ac3d, load_surfaces
 from distrace.data.planes import catalogue, prepare
 from distrace.data.solid import load_solid, load_soup
 
@@ -49,6 +49,18 @@ def test_polygons_become_fans_and_lines_nothing(tmp_path: Path) -> None:
 def test_what_an_object_says_in_words_of_its_own_is_passed_by(tmp_path: Path) -> None:
     content = HEAD + "OBJECT world\nkids 3\n" + poly([TRIANGLE], 'data 7\nOBJECT \ntexture "kids 2"\ncrease 30\n\n')
     assert len(load_ac3d(written(tmp_path, content))) == 1, "and fewer kids than announced are no error"
+
+
+def test_surfaces_know_their_image_where_they_lie_on_it_and_the_colour_of_their_material(tmp_path: Path) -> None:
+    red = 'MATERIAL "b" rgb 0.9 0.1 0  amb 0 0 0  emis 0 0 0  spec 0 0 0  shi 0  trans 0\n'
+    marked = "SURF 0x10\nmat 1\nrefs 3\n0 0 0\n1 0.5 0\n2 0 1\n"
+    image = 'texture "C:\\\\art\\\\my skin.png"\ntexrep 2 1\ntexoff 0 0.25\n'
+    content = f"{HEAD}{red}OBJECT world\nkids 2\n{poly([marked], image)}{poly([TRIANGLE])}"
+    colours, (with_image, plain) = load_surfaces(written(tmp_path, content))
+    np.testing.assert_allclose(colours, [[1, 1, 1], [0.9, 0.1, 0]])
+    assert (with_image.image, plain.image) == ("my skin.png", "")
+    assert (with_image.material.tolist(), plain.material.tolist()) == ([1], [0])
+    np.testing.assert_allclose(with_image.uv, [[[0, 0.25], [1, 0.25], [0, 1.25]]])
 
 
 @pytest.mark.parametrize(
@@ -101,6 +113,21 @@ def test_meshes_and_the_copyright_are_kept_and_nothing_else(deb: Path, tmp_path:
     table = (tmp_path / "out/shapes.csv").read_text().splitlines()
     assert table[0] == "category,name,creator,licence,debian_package,path"
     assert table[1].endswith("flightgear-data-ai/733/Models/73C.ac")
+
+
+def test_a_mesh_has_the_images_that_it_names_beside_it_of_liveries_the_default_one(tmp_path: Path) -> None:
+    root = "games/flightgear/AI/Aircraft/Jet"
+    mesh = HEAD + poly([TRIANGLE], 'texture "skin.png"\n') + poly([TRIANGLE], 'texture "crew/face.rgb"\n')
+    files = {
+        f"{root}/Models/jet.ac": mesh.encode(),
+        f"{root}/Models/crew/face.rgb": b"face",
+        f"{root}/Textures/AirA/skin.png": b"A",
+        f"{root}/Textures/Default/skin.png": b"default",
+        f"{root}/Textures/Default/unused.png": b"unused",
+    }
+    catalogue(write_deb(tmp_path / "flightgear-data-ai_1_all.deb", files), tmp_path / "out")
+    kept = {path.name: path.read_bytes() for path in (tmp_path / "out/flightgear-data-ai/Jet/Models").glob("*.*")}
+    assert kept == {"jet.ac": mesh.encode(), "skin.png": b"default", "face.rgb": b"face"}
 
 
 def test_another_package_is_refused(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import torch
 import tyro
 
 from distrace.cli.bench import Bench
+from distrace.cli.clip import Clip
 from distrace.cli.complete import Complete, Demo
 from distrace.cli.console import errors
 from distrace.cli.data import Data, Sample
@@ -26,6 +27,7 @@ COMMANDS = {
     "pose": Pose,
     "data": Data,
     "sample": Sample,
+    "clip": Clip,
     "train": Train,
     "bench": Bench,
     "evaluate": Evaluate,
@@ -40,7 +42,7 @@ def main() -> None:
         _run(sys.argv[1:])
     except KeyboardInterrupt:
         _end(
-            "stopped; what is written is whole, and train, sample and most tables of evaluate go on from there",
+            "stopped; what is written is whole, and train, sample, clip and most tables of evaluate go on from there",
             130,
         )
     except (ValueError, OSError) as error:

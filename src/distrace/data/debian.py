@@ -38,15 +38,15 @@ def _download(package: str, folder: Path) -> Path:
     return found[0]
 
 
-def unpacked(package: str, deb: Path, folder: Path, arrange: Callable[[Path, Path], None]) -> Path:
+def unpacked(package: str, deb: Path, folder: Path, arrange: Callable[[Path, Path], None], keeping: str = "") -> Path:
     """The package's folder under `folder`: what `arrange` takes there from the files of the .deb, and `copyright`.
 
-    A second call unpacks nothing: a stamp, written last, names the .deb. Raises ValueError if `deb` is missing or
-    broken, or if something else has the folder's name.
+    A second call unpacks nothing: a stamp, written last, names the .deb and what was kept of it. Raises ValueError if
+    `deb` is missing or broken, or if something else has the folder's name.
     """
     if not deb.is_file():
         raise ValueError(f"there is no file {deb}; {by_hand(package)}")
-    home, source = folder / package, f"{deb.name} {deb.stat().st_size}\n"
+    home, source = folder / package, f"{deb.name} {deb.stat().st_size} {keeping}".rstrip() + "\n"
     stamp = home / _STAMP
     if stamp.is_file() and stamp.read_text() == source:
         return home

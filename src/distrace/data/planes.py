@@ -1,5 +1,6 @@
 """A catalogue of aircraft meshes: Debian's package `flightgear-data-ai`, in AC3D, under the GPL."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -12,6 +13,8 @@ LICENCE, CREATOR = "GPL-2.0-or-later", "FlightGear team"
 PARTS = {"light", "lights", "Lights", "refueling"}  # folders
 NO_PLANES = {"Ferry", "SpaceShuttle", "balloon"}
 
+_TEXTURE = re.compile(r'^texture\s+"(?:[^"\n]*[/\\])?([^"\n]+)"', re.MULTILINE)
+
 
 def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
     """One mesh of each aircraft of the package, by `catalogue.listed`."""
@@ -23,7 +26,7 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    home = unpacked(PACKAGE, deb, folder, _arrange)
+    home = unpacked(PACKAGE, deb, folder, _arrange, keeping="meshes and images")
     meshes = [_mesh(aircraft, folder) for aircraft in sorted(home.iterdir()) if _models(aircraft)]
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
@@ -31,12 +34,26 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
 
 def _arrange(content: Path, home: Path) -> None:
-    """Meshes alone: textures, sounds and flight plans are left behind."""
+    """Meshes, each with the images that it names beside it; sounds and flight plans are left behind."""
     root = content / AIRCRAFT
     for path in sorted(root.rglob("*.ac")):
         target = home / path.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
+        for image in _images(path, root / path.relative_to(root).parts[0]):
+            shutil.copy(image, target.parent)
         shutil.move(path, target)
+
+
+def _images(mesh: Path, aircraft: Path) -> list[Path]:
+    """The files of a mesh's textures; of several liveries the default one, or the first."""
+    named = sorted(set(_TEXTURE.findall(mesh.read_text(encoding="latin-1"))))
+    files = [path for path in sorted(aircraft.rglob("*")) if path.is_file()]
+    liveries = [[path for path in files if path.name == name] for name in named]
+
+    def rank(path: Path) -> tuple[bool, bool, Path]:
+        return path.parent != mesh.parent, "default" not in path.parent.name.lower(), path
+
+    return [min(paths, key=rank) for paths in liveries if paths]
 
 
 def _models(aircraft: Path) -> list[Path]:

@@ -81,8 +81,13 @@ def load_soup(path: Path) -> trimesh.Trimesh:
 
 def turned(solid: Solid, degrees: float) -> Solid:
     """The solid rotated about the y axis."""
-    matrix = np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
+    matrix = turn_matrix(degrees)
     return Solid(solid.soup.copy().apply_transform(matrix), solid.surface.copy().apply_transform(matrix))
+
+
+def turn_matrix(degrees: float) -> Float[np.ndarray, "4 4"]:
+    """The rotation about the y axis."""
+    return np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
 
 
 def normalised(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
@@ -113,6 +118,11 @@ def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
         triangles = _quartered(triangles[(share > 0) & (share < 1) & ~small])
     corners = np.concatenate(kept).reshape(-1, 3)
     return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+
+
+def bounding(soup: trimesh.Trimesh) -> Bool[np.ndarray, "faces"]:
+    """Which faces have the solid on exactly one side, at least in parts: none that is buried, and no loose sheet."""
+    return _exposure(soup, soup.triangles.view(np.ndarray))[0] > 0
 
 
 def _exposure(soup: trimesh.Trimesh, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
