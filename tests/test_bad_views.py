@@ -72,7 +72,7 @@ CAMERAS = [
     ({"intrinsics": matrix() / [[40], [32], [1]]}, "focal length of 1 pixels sees 174°"),
     ({"intrinsics": matrix(fx=0.5, fy=0.5, cx=0.5, cy=0.5)}, "focal length of 0.5 pixels sees 177°"),
     ({"intrinsics": matrix(fx=400)}, "400 and 40 pixels"),
-    ({"intrinsics": matrix() * [[4], [4], [1]]}, "for an image of 128 × 160 pixels, and depth is an image of 32 × 40"),
+    ({"intrinsics": matrix() * [[4], [4], [1]]}, "for an image of 128 × 160 pixels, and this is an image of 32 × 40"),
     ({"intrinsics": matrix(cx=400)}, "look at the principal point"),
     ({"intrinsics": matrix().T.copy()}, "last row of intrinsics"),
     ({"intrinsics": matrix(fx=np.inf)}, "not finite"),

@@ -29,7 +29,7 @@ def check_intrinsics(camera: Camera) -> None:
         raise ValueError(f"focal lengths of {fx:.4g} and {fy:.4g} pixels were given; they cannot differ so much")
     if middle.min() > COARSER / 2 and (middle[0] / middle[1]).log().abs() < 0.1:
         point = " × ".join(f"{2 * length:.4g}" for length in across[:2, 2].flip(0).tolist())
-        raise ValueError(f"the intrinsics are for an image of {point} pixels, and depth is {image}; scale them with it")
+        raise ValueError(f"the intrinsics are for an image of {point} pixels, and this is {image}; scale them with it")
 
 
 def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height width"]) -> None:

@@ -1,0 +1,91 @@
+"""The sphere around what masks allow: a visual hull on coarse grids, each about what the one before left.
+
+The hull is Laurentini's, *The visual hull concept for silhouette-based image understanding* (PAMI 1994).
+"""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.data.placement import TELL, Placement, nearest_to_rays, origins_of
+
+CELLS = 40  # along each axis
+ROUNDS = 3
+START = 1.5  # radii: what surely holds the object
+MARGIN = 1.03
+AGREE = 0.9  # of the masks that see a place: one in ten may be wrong
+SEEN = 0.5  # of the views, at least, see what is the object
+
+
+def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "height_ width_"]]) -> Placement:
+    """The smallest sphere around what lies in nearly all of the masks, and a margin.
+
+    Raises `ValueError` where nothing does.
+    """
+    sphere = _around(cameras, masks)
+    for _ in range(ROUNDS):
+        places = _carved(sphere, cameras, masks)
+        if not len(places):
+            raise ValueError(
+                f"nothing lies within the masks of {len(masks)} views together; are they inverted, or the cameras"
+                f" others? If they are right, {TELL}"
+            )
+        sphere = _smallest(places)
+    return Placement(sphere.centre, MARGIN * sphere.radius)
+
+
+def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
+    """About where the rays of the masks' middles meet, as large as the mask that reaches farthest from there."""
+    seen = [camera.rays(camera.pixels()[mask]).directions for camera, mask in zip(cameras, masks)]
+    middles = torch.stack([directions.mean(0) for directions in seen]).double()
+    origins = origins_of(cameras)
+    centre = nearest_to_rays(origins, middles / middles.norm(dim=-1, keepdim=True))
+    radius = 0.0
+    for origin, directions in zip(origins, seen):
+        towards = centre - origin
+        cosine = (directions.double() @ towards / towards.norm()).min().clamp(0, 1)
+        radius = max(radius, (towards.norm() * (1 - cosine**2).sqrt()).item())
+    return Placement(centre, START * radius)
+
+
+def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Float[Tensor, "places 3"]:
+    """Middles of the cells around a sphere, in the world, that nearly all masks which see them allow."""
+    steps = (torch.arange(CELLS, dtype=torch.float64) + 0.5) * 2 / CELLS - 1
+    places = sphere.to_world(torch.cartesian_prod(steps, steps, steps))
+    reach = math.sqrt(3) * sphere.radius / CELLS
+    seen, allowed = torch.zeros(len(places)), torch.zeros(len(places))
+    for camera, mask in zip(cameras, masks):
+        inside, hit = _looked_up(camera, mask, places, reach, sphere.centre)
+        seen += inside
+        allowed += hit
+    return places[(seen >= SEEN * len(cameras)) & (allowed >= AGREE * seen)]
+
+
+def _looked_up(
+    camera: Camera, mask: Tensor, places: Tensor, reach: float, centre: Tensor
+) -> tuple[Bool[Tensor, "places"], Bool[Tensor, "places"]]:
+    """Which places project into the image, and which of these so near to the mask that their cell may touch it."""
+    distance = (centre - camera.T_world_camera[:3, 3]).norm().item()
+    block = max(1, math.ceil(reach * camera.intrinsics[0, 0].item() / distance))
+    block = min(block, camera.height, camera.width)
+    coarse = torch.nn.functional.max_pool2d(mask[None].float(), block, block, ceil_mode=True)
+    coarse = torch.nn.functional.max_pool2d(coarse, 3, 1, 1)[0] > 0
+    pixels, depths = camera.project(places.to(camera.intrinsics.dtype))
+    size = pixels.new_tensor([camera.width, camera.height])
+    inside = (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+    column, row = (pixels[inside] / block).long().unbind(-1)
+    hit = inside.clone()
+    hit[inside] = coarse[row, column]
+    return inside, hit
+
+
+def _smallest(points: Float[Tensor, "points 3"]) -> Placement:
+    """The smallest sphere around points, to a percent: steps to the farthest (Bădoiu and Clarkson, SODA 2003)."""
+    centre = points.mean(0)
+    for step in range(1, 101):
+        centre = centre + (points[(points - centre).norm(dim=-1).argmax()] - centre) / (step + 1)
+    return Placement(centre, (points - centre).norm(dim=-1).max().item())

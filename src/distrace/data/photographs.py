@@ -1,0 +1,150 @@
+"""A folder of photographs with known cameras, in any of five layouts, brought into the frame of the unit sphere."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.data.carving import within_masks
+from distrace.data.checks import check_intrinsics
+from distrace.data.layouts import colmap, idr, middlebury, own, transforms
+from distrace.data.layouts.shots import Shot, Shots, inside
+from distrace.data.photograph import Photograph as Photograph
+from distrace.data.pictures import read_mask, read_picture, save_mask, save_picture
+from distrace.data.placement import Placement as Placement
+from distrace.data.placement import among_points, between_axes
+from distrace.errors import about
+from distrace.files import save_json
+
+LAYOUTS = (own, transforms, idr, middlebury, colmap)
+LOOKED_FOR = (
+    "views.json, transforms.json, transforms_train.json, cameras_sphere.npz, *_par.txt, and COLMAP's cameras.bin or"
+    " cameras.txt in sparse/0, sparse and the folder itself"
+)
+GLARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
+
+
+@dataclass(frozen=True)
+class Photographs:
+    """Views of one object in the unit sphere, and how that lies in the world of their folder."""
+
+    views: tuple[Photograph, ...]
+    placement: Placement
+    layout: str
+
+
+def load_photographs(folder: Path) -> Photographs:
+    """The photographs of a folder, in whichever layout it has.
+
+    Raises `ValueError`, in one sentence that names file and field, for what is missing or makes no sense.
+    """
+    shots = _described(folder)
+    if len(shots.views) < 2:
+        raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
+    views = [_photograph(shot) for shot in shots.views]
+    with about(folder):
+        placement = shots.placement or estimated(views, shots.points)
+    placed = [replace(view, camera=_single(placement.camera_to_unit(view.camera))) for view in views]
+    return Photographs(tuple(placed), placement, shots.layout)
+
+
+def save_photographs(folder: Path, photographs: Photographs) -> None:
+    """Our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
+    names = [view.name for view in photographs.views]
+    if len(set(names)) < len(names):
+        names = [f"{k:03d}_{name}" for k, name in enumerate(names)]
+    entries = [_saved(folder, name, view, photographs.placement) for name, view in zip(names, photographs.views)]
+    placement = photographs.placement
+    sphere = {"centre": placement.centre.tolist(), "radius": placement.radius}
+    save_json(folder / own.NAME, {"views": entries, "unit_sphere": sphere})
+
+
+def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> Placement:
+    """From the masks if two views have one, else from points that are known, else from where the cameras look.
+
+    Raises `ValueError` where none of these tells.
+    """
+    masked = [(view.camera, view.mask) for view in views if view.mask is not None and view.mask.any()]
+    if len(masked) >= 2:
+        return within_masks(*zip(*masked))
+    among = None if points is None else among_points(points)
+    return among or between_axes([view.camera for view in views])
+
+
+def notes(photographs: Photographs) -> list[str]:
+    """Sentences about views that can be used but look wrong."""
+    return [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
+
+
+def _described(folder: Path) -> Shots:
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}")
+    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
+    if shots is None:
+        raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
+    return shots
+
+
+def _photograph(shot: Shot) -> Photograph:
+    with about(shot.field):
+        image, mask = read_picture(shot.image)
+        mask = mask if shot.mask is None else read_mask(shot.mask)
+        height, width = image.shape[:2]
+        if shot.size not in (None, (height, width)):
+            told = f"{shot.size[0]} × {shot.size[1]}"
+            raise ValueError(f"{shot.image} has {height} × {width} pixels, and the camera's image {told}")
+        if mask is not None and mask.shape != image.shape[:2]:
+            other = f"{mask.shape[0]} × {mask.shape[1]}"
+            raise ValueError(f"{shot.mask} has {other} pixels, and its image {shot.image.name} {height} × {width}")
+        matrices = torch.from_numpy(shot.intrinsics), torch.from_numpy(shot.T_world_camera)
+        camera = Camera.from_matrices(*matrices, height, width)
+        check_intrinsics(camera)
+    return Photograph(shot.image.stem, camera, image, mask)
+
+
+def _single(camera: Camera) -> Camera:
+    return replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
+
+
+def _saved(folder: Path, name: str, view: Photograph, placement: Placement) -> dict[str, object]:
+    """What views.json says of a view, whose files are written."""
+    entry: dict[str, object] = {"image": f"images/{name}.png"}
+    save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
+    if view.mask is not None:
+        entry["mask"] = f"masks/{name}.png"
+        save_mask(folder / "masks" / f"{name}.png", view.mask)
+    double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
+    entry["intrinsics"] = view.camera.intrinsics.tolist()
+    return entry | {"T_world_camera": placement.camera_to_world(double).T_world_camera.tolist()}
+
+
+def _remarks(view: Photograph) -> list[str]:
+    found: list[str] = []
+    if (view.image == view.image[0, 0]).all():
+        found.append("is of one colour all over; is its file whole?")
+    elif (white := (view.image >= 1).all(-1).float().mean()) > GLARE:
+        found.append(f"is fully white at {white:.0%} of its pixels; it is over-exposed, or nothing but background")
+    if view.mask is not None and not view.mask.any():
+        found.append("has a mask that marks no pixel as object")
+    if view.mask is not None and view.mask.all():
+        found.append("has a mask that marks every pixel as object")
+    if _place(view).norm() <= 1:
+        found.append("was taken from within the unit sphere, where the object is; give a smaller unit_sphere")
+    elif not _sees(view.camera):
+        found.append("does not show the middle of the unit sphere; is its camera right?")
+    return found
+
+
+def _place(view: Photograph) -> Float[Tensor, "3"]:
+    return view.camera.T_world_camera[:3, 3]
+
+
+def _sees(camera: Camera) -> bool:
+    pixel, depth = camera.project(camera.T_world_camera.new_zeros(3))
+    size = pixel.new_tensor([camera.width, camera.height])
+    return bool(depth > 0 and (pixel >= 0).all() and (pixel <= size).all())

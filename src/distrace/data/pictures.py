@@ -1,0 +1,76 @@
+"""Image files as tensors: the colours of a photograph, and masks of the object in it."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from PIL import Image
+from torch import Tensor
+
+from distrace.errors import explained
+from distrace.files import written
+
+FORMATS = ("PNG", "JPEG")
+PLAIN = ("L", "LA", "RGB", "RGBA")
+DEEP = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
+
+
+def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"] | None]:
+    """Colours from 0 to 1 as they are stored, and where alpha is more than half (None where there is no alpha).
+
+    The orientation in EXIF is left alone, as cameras are given for the pixels as they are stored. Of 16-bit colour
+    the upper eight bits are read. Raises `ValueError` for a file that is no PNG or JPEG, or is cut off.
+    """
+    levels = _levels(path)
+    channels = levels.shape[-1]
+    colour = levels[..., :3] if channels >= 3 else levels[..., :1].expand(-1, -1, 3)
+    return colour.contiguous(), levels[..., -1] > 0.5 if channels in (2, 4) else None
+
+
+def read_mask(path: Path) -> Bool[Tensor, "height width"]:
+    """Where the mean of the colours, and alpha if there is one, are more than half.
+
+    Raises `ValueError` as `read_picture` does, and for a mask of 0 and 1 in levels of 255, which looks all black.
+    """
+    colour, alpha = read_picture(path)
+    if 0 < colour.max() <= 0.5:
+        raise ValueError(
+            f"{path} is nowhere brighter than {255 * colour.max().item():.0f} of 255; a mask is white where the object"
+            " is, and black elsewhere"
+        )
+    bright = colour.mean(-1) > 0.5
+    return bright if alpha is None else bright & alpha
+
+
+def picture_size(path: Path) -> tuple[int, int]:
+    """Height and width in pixels, as stored; raises `ValueError` for a file that is no PNG or JPEG."""
+    with explained(f"{path} cannot be read as a PNG or JPEG image"):
+        with Image.open(path, formats=FORMATS) as file:
+            return file.height, file.width
+
+
+def save_picture(path: Path, image: Float[Tensor, "height width 3"]) -> None:
+    """As a PNG of eight bits."""
+    _save(path, (image.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8).numpy())
+
+
+def save_mask(path: Path, mask: Bool[Tensor, "height width"]) -> None:
+    """As a grey PNG, white where the object is."""
+    _save(path, mask.cpu().numpy().astype(np.uint8) * 255)
+
+
+def _levels(path: Path) -> Float[Tensor, "height width channels"]:
+    with explained(f"{path} cannot be read as a PNG or JPEG image"):
+        with Image.open(path, formats=FORMATS) as file:
+            full = 65535 if file.mode in DEEP else 255
+            plain = (
+                file if file.mode in (*PLAIN, *DEEP) else file.convert("RGBA" if file.has_transparency_data else "RGB")
+            )
+            levels = np.array(plain)
+    return torch.from_numpy(levels.astype(np.float32) / full).reshape(*levels.shape[:2], -1)
+
+
+def _save(path: Path, levels: np.ndarray) -> None:
+    with written(path) as file:
+        Image.fromarray(levels).save(file, "PNG")

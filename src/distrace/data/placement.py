@@ -1,0 +1,117 @@
+"""Where the unit sphere lies in the world of a folder of photographs, told or estimated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+
+FEWEST = 20  # points that tell where an object is
+SHARE = 0.9  # of the points that lie within; the others are background and outliers
+MARGIN = 1.1
+PARALLEL = 1e-4  # of what the information on the worst known direction would be from all sides
+TELL = "tell where the object is as unit_sphere in views.json"
+
+
+@dataclass(frozen=True)
+class Placement:
+    """World = centre + radius · unit: centre and radius of the unit sphere, in the units of the folder's world."""
+
+    centre: Float[Tensor, "3"]
+    radius: float
+
+    def to_world(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        centre = self._centre(points)
+        return (centre + self.radius * points.to(centre.dtype)).to(points.dtype)
+
+    def to_unit(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
+        centre = self._centre(points)
+        return ((points.to(centre.dtype) - centre) / self.radius).to(points.dtype)
+
+    def camera_to_world(self, camera: Camera) -> Camera:
+        return _moved(camera, self.to_world(camera.T_world_camera[..., :3, 3]))
+
+    def camera_to_unit(self, camera: Camera) -> Camera:
+        return _moved(camera, self.to_unit(camera.T_world_camera[..., :3, 3]))
+
+    def _centre(self, points: Tensor) -> Tensor:
+        # Worlds may lie far from their origin, so a centre in double is not rounded before it is subtracted.
+        return self.centre.to(points.device)
+
+
+def placement_of(centre: object, radius: object) -> Placement:
+    """Raises `ValueError` where they are not three finite numbers and a positive one."""
+    numbers = isinstance(centre, list) and len(centre) == 3 and all(_finite(value) for value in centre)
+    if not numbers or not isinstance(radius, int | float) or not _finite(radius) or not radius > 0:
+        raise ValueError(
+            f"its centre is {centre} and its radius {radius}; three numbers and a positive one are needed, in the units"
+            " of T_world_camera"
+        )
+    return Placement(torch.tensor(centre, dtype=torch.float64), float(radius))
+
+
+def among_points(points: Float[np.ndarray, "points 3"]) -> Placement | None:
+    """The sphere around the median of points that holds nine in ten of them, and a margin; None for too few."""
+    if len(points) < FEWEST:
+        return None
+    there = torch.from_numpy(points).double()
+    centre = there.median(0).values
+    radius = (there - centre).norm(dim=-1).quantile(SHARE).item() * MARGIN
+    return Placement(centre, radius) if radius > 0 else None
+
+
+def between_axes(cameras: Sequence[Camera]) -> Placement:
+    """The sphere around what the views show whole, about the point nearest to the rays of their middles.
+
+    Its radius is the median of distance · sin(half of the diagonal field of view): of the smaller field, as much as
+    fits into the views, it would cut off a third of Middlebury's temple. Raises `ValueError` where the rays are
+    parallel, or meet behind the cameras.
+    """
+    middles = torch.cat([camera.rays(_middle(camera)).directions for camera in cameras]).double()
+    centre = nearest_to_rays(origins_of(cameras), middles)
+    distance = (centre - origins_of(cameras)).norm(dim=-1)
+    half = torch.stack([_half_field(camera) for camera in cameras]).double()
+    return Placement(centre, (distance * half.sin()).median().item())
+
+
+def origins_of(cameras: Sequence[Camera]) -> Float[Tensor, "views 3"]:
+    return torch.stack([camera.T_world_camera[:3, 3] for camera in cameras]).double()
+
+
+def nearest_to_rays(origins: Float[Tensor, "views 3"], directions: Float[Tensor, "views 3"]) -> Float[Tensor, "3"]:
+    """The point with the least sum of squared distances to lines: Σ (I − d dᵀ) (x − o) = 0.
+
+    Raises `ValueError` where they are parallel to about a degree, or the point is behind half of the origins.
+    """
+    across = torch.eye(3, dtype=origins.dtype) - directions[:, :, None] * directions[:, None]
+    if torch.linalg.eigvalsh(across.mean(0))[0] < PARALLEL:
+        raise ValueError(f"the {len(origins)} views look in one direction, so their axes meet nowhere; {TELL}")
+    point = torch.linalg.solve(across.sum(0), (across @ origins[..., None]).sum(0))[:, 0]
+    if ((point - origins) * directions).sum(-1).median() <= 0:
+        raise ValueError(f"the views look away from each other: their axes meet behind the cameras; {TELL}")
+    return point
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, int | float) and bool(np.isfinite(value))
+
+
+def _moved(camera: Camera, place: Float[Tensor, "*batch 3"]) -> Camera:
+    pose = camera.T_world_camera.clone()
+    pose[..., :3, 3] = place
+    return replace(camera, T_world_camera=pose)
+
+
+def _middle(camera: Camera) -> Float[Tensor, "1 2"]:
+    return camera.intrinsics.new_tensor([[camera.width / 2, camera.height / 2]])
+
+
+def _half_field(camera: Camera) -> Float[Tensor, ""]:
+    """The largest angle, in radians, between the ray of the image's middle and those of its corners."""
+    corners = [[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]]
+    towards = camera.rays(camera.intrinsics.new_tensor(corners)).directions
+    return torch.acos((towards @ camera.rays(_middle(camera)).directions[0]).clamp(-1, 1)).max()
