@@ -21,7 +21,7 @@ AGREE = 0.9  # of the masks that see a place: one in ten may be wrong
 SEEN = 0.5  # of the views, at least, see what is the object
 
 
-def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "height_ width_"]]) -> Placement:
+def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]) -> Placement:
     """The smallest sphere around what lies in nearly all of the masks, and a margin.
 
     Raises `ValueError` where nothing does.

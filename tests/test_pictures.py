@@ -1,0 +1,90 @@
+"""Image files as tensors."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from distrace.data.pictures import picture_size, read_mask, read_picture, save_mask, save_picture
+
+LEVELS = np.random.default_rng(1).integers(0, 256, (5, 7, 4), np.uint8)
+
+
+def stored(folder: Path, levels: np.ndarray, name: str = "a.png") -> Path:
+    Image.fromarray(levels).save(folder / name)
+    return folder / name
+
+
+def deep_colour(levels: np.ndarray) -> bytes:
+    """A PNG of 16 bits per colour, which Pillow does not write."""
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in levels)
+    header = struct.pack(">IIBBBBB", levels.shape[1], levels.shape[0], 16, 2, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", zlib.compress(rows)), (b"IEND", b""))
+    body = b"".join(struct.pack(">I", len(c)) + n + c + struct.pack(">I", zlib.crc32(n + c)) for n, c in chunks)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def test_colours_are_as_stored_and_alpha_is_a_mask(tmp_path: Path) -> None:
+    image, mask = read_picture(stored(tmp_path, LEVELS))
+    assert image.dtype == torch.float32
+    assert torch.equal(image, torch.from_numpy(LEVELS[..., :3].astype(np.float32) / 255))
+    assert mask is not None
+    assert torch.equal(mask, torch.from_numpy(LEVELS[..., 3] > 127))
+    assert read_picture(stored(tmp_path, LEVELS[..., :3]))[1] is None
+
+
+def test_grey_is_three_equal_colours_in_eight_bits_and_in_sixteen(tmp_path: Path) -> None:
+    for levels, full in ((LEVELS[..., 0], 255), (LEVELS[..., 0].astype(np.uint16) * 257, 65535)):
+        image, _ = read_picture(stored(tmp_path, levels))
+        expected = torch.from_numpy(levels.astype(np.float32) / full)
+        assert torch.equal(image, expected[..., None].expand(-1, -1, 3))
+
+
+def test_deep_colours_keep_their_upper_eight_bits(tmp_path: Path) -> None:
+    levels = np.minimum(LEVELS[..., :3].astype(np.uint32) * 257 + 96, 65535)
+    (tmp_path / "deep.png").write_bytes(deep_colour(levels))
+    image, _ = read_picture(tmp_path / "deep.png")
+    torch.testing.assert_close(image, torch.from_numpy(levels / 65535).float(), atol=1 / 255, rtol=0)
+
+
+def test_a_palette_and_a_bitmap_are_read_as_colours(tmp_path: Path) -> None:
+    flat = np.where(LEVELS[..., :1] > 100, np.uint8([200, 10, 60]), np.uint8([0, 0, 90]))
+    Image.fromarray(flat).quantize(2).save(tmp_path / "palette.png")
+    assert torch.equal((read_picture(tmp_path / "palette.png")[0] * 255).round().byte(), torch.from_numpy(flat))
+    assert torch.equal(read_mask(stored(tmp_path, LEVELS[..., 0] > 90)), torch.from_numpy(LEVELS[..., 0] > 90))
+
+
+def test_pictures_and_masks_are_read_as_they_were_saved(tmp_path: Path) -> None:
+    image, mask = torch.from_numpy(LEVELS[..., :3].astype(np.float32) / 255), torch.from_numpy(LEVELS[..., 3] > 60)
+    save_picture(tmp_path / "deeper" / "a.png", image)
+    save_mask(tmp_path / "m.png", mask)
+    assert torch.equal(read_picture(tmp_path / "deeper" / "a.png")[0], image)
+    assert torch.equal(read_mask(tmp_path / "m.png"), mask)
+    assert picture_size(tmp_path / "m.png") == (5, 7)
+
+
+def test_exif_leaves_the_image_as_it_is_stored(tmp_path: Path) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6  # to be turned by a quarter
+    Image.fromarray(LEVELS[..., :3]).save(tmp_path / "turned.jpg", exif=exif)
+    assert read_picture(tmp_path / "turned.jpg")[0].shape == (5, 7, 3)
+    assert picture_size(tmp_path / "turned.jpg") == (5, 7)
+
+
+def test_a_mask_of_ones_in_255_is_told_and_an_empty_one_is_one(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="a.png is nowhere brighter than 1 of 255"):
+        read_mask(stored(tmp_path, (LEVELS[..., 0] > 60).astype(np.uint8)))
+    assert not read_mask(stored(tmp_path, np.zeros((4, 4), np.uint8))).any()
+
+
+def test_what_is_no_image_is_told_in_one_sentence(tmp_path: Path) -> None:
+    whole = stored(tmp_path, np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).read_bytes()
+    for content in (b"", b"no image", whole[:2000], whole[:20]):
+        (tmp_path / "bad.png").write_bytes(content)
+        with pytest.raises(ValueError, match="bad.png cannot be read as a PNG or JPEG image") as caught:
+            read_picture(tmp_path / "bad.png")
+        assert "\n" not in str(caught.value)
