@@ -10,7 +10,19 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from photographed import SIZES, WORLD, ball, cameras, colours, cut, in_world, reads_back, refused, write_images, write_masks
+from photographed import (
+    SIZES,
+    WORLD,
+    ball,
+    cameras,
+    colours,
+    cut,
+    in_world,
+    reads_back,
+    refused,
+    write_images,
+    write_masks,
+)
 
 from distrace.camera import Camera
 from distrace.data.layouts.idr import decomposed
@@ -80,7 +92,9 @@ def test_what_is_told_for_all_frames_holds_for_each_and_masks_are_read(tmp_path:
     write_masks(tmp_path / "masks")
     loaded = load_photographs(frames(tmp_path, common))
     assert [view.camera.intrinsics[0, 0].item() for view in loaded.views] == [32.0, 32.0]
-    assert all(view.mask is not None and torch.equal(view.mask, ball(cameras()[2 * k])) for k, view in enumerate(loaded.views))
+    assert all(
+        view.mask is not None and torch.equal(view.mask, ball(cameras()[2 * k])) for k, view in enumerate(loaded.views)
+    )
 
 
 def frame(**values: object) -> Callable[[dict], object]:
@@ -91,7 +105,10 @@ SCALED = np.diag([3.0, 3, 3, 1]).tolist()
 FRAMES = {
     "distorted": (frame(k1=0.1), ("frames[1]", "k1 is 0.1", "undistort")),
     "all distorted": (lambda content: content.update(p1=-0.01), ("frames[0]", "p1 is -0.01", "undistort")),
-    "fisheye": (lambda content: content.update(camera_model="OPENCV_FISHEYE"), ("camera_model", "FISHEYE", "undistort")),
+    "fisheye": (
+        lambda content: content.update(camera_model="OPENCV_FISHEYE"),
+        ("camera_model", "FISHEYE", "undistort"),
+    ),
     "no image": (frame(file_path="images/none"), ("frames[1]", "file_path names images/none")),
     "outside": (frame(file_path="images/../../x.png"), ("frames[1]", "file_path", "leaves")),
     "no mask": (frame(mask_path="masks/1.png"), ("frames[1]", "mask_path names masks/1.png")),
