@@ -30,6 +30,7 @@ ORDER = [
     *("losses", "warp", "metrics", "mesh", "data", "targets", "sight"),
     *("train", "resume", "prior", "starts", "fit", "fit_samples"),
     *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
+    *("regions", "photo_pairs", "photo_residuals", "photo_stage", "fit_photos", "doubtful"),
     *(
         "bench",
         "ablation",
@@ -53,6 +54,7 @@ ORDER = [
         "scene",
         "tables",
         "report",
+        "views_page",
         "depth_tables",
         "card",
         "viewer",

@@ -1,7 +1,7 @@
 """Rigid motions of an object before a camera, and how far two of them are apart."""
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import roma
 import torch
@@ -9,6 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.rays import Rays
 
 
 def object_in_camera(camera: Camera) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
@@ -58,3 +59,55 @@ def pose_error(camera: Camera, truth: Camera) -> tuple[float, float]:
     (rotation, translation), (true, there) = (object_in_camera(which) for which in (camera, truth))
     degrees = math.degrees(float(roma.rotmat_geodesic_distance(rotation.double(), true.double())))
     return degrees, 100 * float((translation - there).norm() / there.norm())
+
+
+@dataclass(frozen=True)
+class Similarity:
+    """Where an object lies in the world: x_world = scale · rotation · x_object + translation."""
+
+    rotation: Float[Tensor, "3 3"]
+    translation: Float[Tensor, "3"]
+    scale: Float[Tensor, ""]
+
+    @staticmethod
+    def identity() -> "Similarity":
+        return Similarity(torch.eye(3), torch.zeros(3), torch.ones(()))
+
+    @property
+    def T_world_object(self) -> Float[Tensor, "4 4"]:
+        matrix = torch.eye(4).to(self.rotation)
+        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        return matrix
+
+    def to_world(self, points_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return self.scale * self.turned(points_object) + self.translation
+
+    def turned(self, vectors_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Directions of the object, in the world."""
+        return vectors_object @ self.rotation.T
+
+    def rays_in_object(self, rays: Rays) -> Rays:
+        """Rays of the world as the object has them; distances along them are divided by the scale."""
+        return Rays((rays.origins - self.translation) @ self.rotation / self.scale, rays.directions @ self.rotation)
+
+    def camera_in_object(self, camera: Camera) -> Camera:
+        """The camera that sees the object in its own frame as the given one does in the world; depths are divided."""
+        pose = camera.T_world_camera.clone()
+        pose[:3, :3] = self.rotation.T @ pose[:3, :3]
+        pose[:3, 3] = (pose[:3, 3] - self.translation) @ self.rotation / self.scale
+        return replace(camera, T_world_camera=pose)
+
+    def moved(self, step: Float[Tensor, "7"]) -> "Similarity":
+        """Turned about the object's middle by an axis times an angle, shifted, in the world's axes, and grown by e to
+        the last."""
+        turned: Tensor = roma.special_procrustes(roma.rotvec_to_rotmat(step[:3]) @ self.rotation)  # pyright: ignore[reportAssignmentType]
+        return Similarity(turned, self.translation + step[3:6], self.scale * step[6].exp())
+
+    def change(self, points_object: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 7"]:
+        """By which the object's field, whose gradient there is given, changes at fixed points of the world as it moves.
+
+        In the object's frame those points move the other way: x → x − (ω × x + τ / scale + σ x).
+        """
+        turning = torch.linalg.cross(points_object, gradient) @ self.rotation.T
+        growing = (points_object * gradient).sum(-1, keepdim=True)
+        return -torch.cat([turning, self.turned(gradient) / self.scale, growing], dim=1)

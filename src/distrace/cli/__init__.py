@@ -15,6 +15,7 @@ from distrace.cli.console import errors
 from distrace.cli.data import Data, Sample
 from distrace.cli.evaluate import Evaluate
 from distrace.cli.gradients import CheckGradients
+from distrace.cli.multiview import Multiview
 from distrace.cli.pose import Pose
 from distrace.cli.show import Mesh, Render
 from distrace.cli.train import Train
@@ -25,6 +26,7 @@ COMMANDS = {
     "mesh": Mesh,
     "complete": Complete,
     "pose": Pose,
+    "multiview": Multiview,
     "data": Data,
     "sample": Sample,
     "clip": Clip,

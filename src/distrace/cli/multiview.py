@@ -1,0 +1,103 @@
+"""`multiview`: a shape from photographs with known cameras, by a model of its class."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, cast
+
+import numpy as np
+import torch
+import trimesh
+import tyro
+
+from distrace.checkpoint import Model
+from distrace.cli.common import Flag, ModelName, opened, save_mesh
+from distrace.cli.console import console, progress, start
+from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
+from distrace.doubtful import Agreement, agreements
+from distrace.files import save_text, written
+from distrace.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.movie import save_gif
+from distrace.photo_residuals import Shape
+from distrace.photo_stage import Comparing
+from distrace.prior import prior_of
+from distrace.views_page import forming, views_page
+
+
+@dataclass(frozen=True)
+class Multiview:
+    """Find a shape, and where it lies, from photographs with known cameras: no depth, no masks."""
+
+    model: ModelName
+    views: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIEWS")]]
+    """a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/"""
+    out: Path = Path("out/multiview")
+    starts: int = PhotoConfig.starts
+    fixed: Flag = False  # the shape lies in the unit sphere as the model's shapes do; only its code is unknown
+    changing_light: Flag = False  # compare colours without their local brightness and contrast
+    ignore_masks: Flag = False
+    rays: int = Comparing.rays  # of all views, in each stage
+    resolution: int = 256  # of the mesh
+    seed: int = 0
+
+    def run(self) -> None:
+        run = start(self.out)
+        model, found = opened(self.model, run.device), load_photographs(self.views)
+        console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}", markup=False)
+        for note in notes(found):
+            console.print(note, markup=False)
+        views = [replace(view, mask=None) for view in found.views] if self.ignore_masks else list(found.views)
+        compared = Comparing(rays=self.rays, moves=not self.fixed, same_light=not self.changing_light)
+        config = PhotoConfig(starts=self.starts, seed=self.seed, compared=compared)
+        steps = _fitted(model, views, config)
+        last, prior = steps[-1], prior_of(model.codes)
+        shape = Shape(prior.coordinates(last.code), last.place)
+        agreed = agreements(model.decoder, views, prior, shape, compared)
+        for view in agreed:
+            if view.doubtful:
+                console.print(_doubt(view), markup=False)
+        mesh = _mesh(model, last, found, MeshConfig(self.resolution))
+        save_mesh(run.out / "mesh.ply", mesh)
+        with written(run.out / "code.npy") as file:
+            np.save(file, last.code.numpy())
+        save_gif(run.out / "forming.gif", forming(model, steps, views[0].camera))
+        save_text(run.out / "report.html", views_page(model, views, steps, agreed, mesh))
+        run.finish(
+            {
+                "loss": last.loss,
+                "terms": last.terms,
+                "start": last.start,
+                "T_unit_object": last.place.T_world_object.tolist(),
+                "unit_sphere": {"centre": found.placement.centre.tolist(), "radius": found.placement.radius},
+                "doubtful": [view.name for view in agreed if view.doubtful],
+                "evaluations": sum(step.evaluations for step in steps),
+                "setup_evaluations": 0,
+            }
+        )
+
+
+def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> list[PhotoStep]:
+    steps: list[PhotoStep] = []
+    with progress("fitting", config.total) as bar:
+        for step in fit_photos(model.decoder, views, prior_of(model.codes), config):
+            steps.append(cast(PhotoStep, step))
+            bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+    return steps
+
+
+def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> trimesh.Trimesh:
+    """In the world of the folder."""
+    mesh = extract_mesh(model.field(step.code), config)
+    vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
+    mesh.vertices = found.placement.to_world(step.place.to_world(vertices)).numpy()
+    return mesh
+
+
+def _described(found: Photographs) -> str:
+    centre = ", ".join(f"{x:.4g}" for x in found.placement.centre.tolist())
+    return f"the unit sphere lies around ({centre}) with a radius of {found.placement.radius:.4g}"
+
+
+def _doubt(view: Agreement) -> str:
+    return f"{view.name} does not agree with the others: its colours are off by {view.colour:.2f}; is its camera right?"

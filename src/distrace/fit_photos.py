@@ -1,0 +1,116 @@
+"""Fitting a shape's code, and where the shape lies, to photographs: no depth, no masks, known cameras.
+
+From coarse images to fine ones, by Levenberg–Marquardt. As in DIST (Liu et al., CVPR 2020, section 4.3) the shape and a
+similarity are found together, from several starts.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import torch
+
+from distrace.data.photograph import Photograph
+from distrace.decoder import Decoder
+from distrace.photo_residuals import Shape
+from distrace.photo_stage import Comparing, Stage
+from distrace.pose import Similarity
+from distrace.prior import Prior
+from distrace.solver import SolverConfig, charbonnier, minimise
+from distrace.starts import Starts, Step, best_of
+
+SCREENED = 1000  # rays on which the training shapes are compared
+
+
+@dataclass(frozen=True)
+class PhotoConfig(Starts):
+    """Stages of a pyramid; each start is tried on the first ones."""
+
+    iterations: int = 24
+    starts: int = 4
+    trial: int = 8
+    levels: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, 1.0, 1.0)  # of the images' size, a stage each
+    compared: Comparing = Comparing()
+    scale: float = 0.06  # up to which misplaced outlines count by their squares in the first stage …
+    narrowing: float = 0.6  # … and × this from one to the next
+    damping: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.levels or not all(0 < level <= 1 for level in self.levels):
+            raise ValueError(f"levels {self.levels} were given; each is a part of the images' size, up to 1")
+
+    @property
+    def stage_lengths(self) -> list[int]:
+        count = len(self.levels)
+        ends = [self.iterations * stage // count for stage in range(count + 1)]
+        return [end - begin for begin, end in pairwise(ends)]
+
+
+@dataclass(frozen=True)
+class PhotoStep(Step):
+    """The code and the place after an iteration."""
+
+    place: Similarity = field(default_factory=Similarity.identity)
+
+
+def fit_photos(
+    decoder: Decoder,
+    photographs: Sequence[Photograph],
+    prior: Prior,
+    config: PhotoConfig = PhotoConfig(),
+    place: Similarity | None = None,
+) -> Iterator[Step]:
+    """Fits a shape to photographs whose cameras see the unit sphere. The last step, a `PhotoStep`, is the result.
+
+    Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
+    place; the one whose loss falls lowest goes on. Raises `ValueError` for fewer than two photographs.
+    """
+    if len(photographs) < 2:
+        raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
+    stages = [Stage.of(photographs, level, config.compared) for level in config.levels]
+    there = place or Similarity.identity()
+    shapes = [Shape(w, there) for w in _starts(decoder, stages[0], prior, config, there)]
+    return best_of(config, lambda start: _solved(decoder, stages, prior, config, start, shapes[start]), recent=1)
+
+
+def ranked(
+    decoder: Decoder, stage: Stage, prior: Prior, config: Comparing, place: Similarity, seed: int = 0
+) -> list[tuple[float, torch.Tensor]]:
+    """The training shapes' losses and coordinates, the least loss first."""
+    found = []
+    for w in map(prior.coordinates, prior.codes):
+        random = torch.Generator().manual_seed(seed)
+        problem, look = stage.problem(decoder, prior, Shape(w, place), config, random)
+        terms = problem.terms(look, problem.residuals(look))
+        found.append((terms["colour"] + terms["outline"], w))
+    return sorted(found, key=lambda pair: pair[0])
+
+
+def _starts(decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, place: Similarity) -> list[torch.Tensor]:
+    """The mean's coordinates, those of training shapes, and a draw."""
+    if config.starts == 1:
+        return [prior.start(0, config.seed)]
+    few = replace(config.compared, rays=SCREENED)
+    nearest = [w for _, w in ranked(decoder, stage, prior, few, place, config.seed)[: config.starts - 2]]
+    draws = [prior.start(k, config.seed) for k in range(1, config.starts - len(nearest))]
+    return [prior.start(0, config.seed), *nearest, *draws]
+
+
+def _solved(
+    decoder: Decoder, stages: Sequence[Stage], prior: Prior, config: PhotoConfig, start: int, shape: Shape
+) -> Iterator[PhotoStep]:
+    began, done, damping = time.perf_counter(), 0, config.damping
+    random = torch.Generator().manual_seed(config.seed)
+    for number, (stage, length) in enumerate(zip(stages, config.stage_lengths, strict=True)):
+        problem, look = stage.problem(decoder, prior, shape, config.compared, random)
+        problem.scale, evaluations = config.scale * config.narrowing**number, 0
+        solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
+        for found in minimise(problem.residuals, look, problem.moved, solver):
+            shape, damping, done = found.state.shape, found.damping, done + 1
+            terms = problem.terms(found.state, found.residuals)
+            seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
+            loss, code = sum(terms.values()), prior.code(shape.w)
+            yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, shape.place)
+            began = time.perf_counter()

@@ -1,0 +1,138 @@
+"""One level of the pyramid of photographs: rays drawn, pixels told apart by colour, and which view sees which point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from distrace.data.photograph import Photograph
+from distrace.decoder import Decoder
+from distrace.field import SDF
+from distrace.photo_pairs import Colours, partners, without_light
+from distrace.photo_residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
+from distrace.pose import Similarity
+from distrace.prior import Prior
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.regions import Regions
+from distrace.surface import normals
+from distrace.targets import drawn
+from distrace.trace import sphere_trace
+
+LEAVING = 0.03  # from a surface point towards another view, before a surface in between can hide it
+FACING = 0.2  # the least cosine between a normal and the direction to another view
+DOUBT = 0.3  # a colour whose certainty is less tells nothing
+WATCHED = 0.1  # rays of the background that come no closer than this are left out
+
+
+@dataclass(frozen=True)
+class Comparing:
+    """How photographs are compared."""
+
+    rays: int = 4000  # of all views
+    partners: int = 4  # of each view
+    weights: PhotoWeights = PhotoWeights()
+    moves: bool = True  # whether the shape's place is unknown, too
+    same_light: bool = True  # otherwise colours are compared without their local mean and contrast
+
+    def __post_init__(self) -> None:
+        if self.rays < 1 or self.partners < 1:
+            raise ValueError(f"{self.rays} rays and {self.partners} partners were asked for; both must be at least 1")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Photographs at one level of the pyramid."""
+
+    photographs: Sequence[Photograph]
+    pictures: Sequence[Colours]  # what is compared of them
+    partners: Int[Tensor, "views count"]  # to compare each view with; -1 where there are fewer
+
+    @staticmethod
+    def of(photographs: Sequence[Photograph], level: float, config: Comparing) -> "Stage":
+        coarse = [photograph.resized(level) for photograph in photographs]
+        images = [each.image if config.same_light else without_light(each.image) for each in coarse]
+        pictures = [Colours.of(image, each.camera) for image, each in zip(images, coarse, strict=True)]
+        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners))
+
+    @torch.no_grad()
+    def problem(
+        self, decoder: Decoder, prior: Prior, shape: Shape, config: Comparing, random: torch.Generator
+    ) -> tuple[PhotoProblem, Look]:
+        """Rays drawn anew, what their pixels show by what is known so far, and who else sees it."""
+        view, index = self._drawn(config.rays, random)
+        rays, colours = self._read(view, index, [each.image for each in self.photographs])
+        _, compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
+        in_object, sdf = shape.place.rays_in_object(rays), decoder.field(prior.code(shape.w))
+        trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
+        sure = self._certainty(view, index, colours, trace.hit)
+        far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
+        kept = (trace.hit | (sure > 0) | (sure < 0) & ~far).nonzero()[:, 0]
+        seen = Sightings(rays, view, compared, sure)[kept]
+        view, in_object, trace = view[kept], in_object[kept], trace[kept]
+        asked = (trace.hit & (seen.certainty >= 0)).nonzero()[:, 0]
+        visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
+        pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
+        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves)
+        problem.evaluations += trace.total_evaluations + len(view)
+        return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
+
+    def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+        """As many pixels of each view, of those whose rays meet the unit sphere."""
+        share = -(-count // len(self.photographs))
+        chosen = [drawn(self._meets(number).nonzero()[:, 0], share, random) for number in range(len(self.photographs))]
+        return torch.cat([torch.full_like(some, number) for number, some in enumerate(chosen)]), torch.cat(chosen)
+
+    def _meets(self, number: int) -> Bool[Tensor, "pixels"]:
+        return meet_sphere(self.photographs[number].camera.rays()).meets.reshape(-1)
+
+    def _read(
+        self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], images: Sequence[Float[Tensor, "height width channels"]]
+    ) -> tuple[Rays, Float[Tensor, "n channels"]]:
+        """The rays of pixels, view by view, and what images have there."""
+        origins, directions, colours = [], [], []
+        for number, (each, image) in enumerate(zip(self.photographs, images, strict=True)):
+            chosen = index[view == number]
+            rays = each.camera.rays(each.camera.pixels().reshape(-1, 2)[chosen])
+            origins.append(rays.origins)
+            directions.append(rays.directions)
+            colours.append(image.reshape(-1, image.shape[-1])[chosen])
+        return Rays(torch.cat(origins), torch.cat(directions)), torch.cat(colours)
+
+    def _certainty(
+        self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], colours: Float[Tensor, "n 3"], hit: Bool[Tensor, "n"]
+    ) -> Float[Tensor, "n"]:
+        """By the masks where there are some, otherwise by colours: those of hits against all others."""
+        beyond = [each.image.reshape(-1, 3)[~self._meets(k)] for k, each in enumerate(self.photographs)]
+        background = torch.cat([colours[~hit], *beyond])
+        is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
+        regions = Regions.of(torch.cat([colours[hit], background]), is_object)
+        images = [2 * regions.smooth_probability(each.image)[..., None] - 1 for each in self.photographs]
+        sure = self._read(view, index, images)[1][:, 0]
+        sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
+        for number, each in enumerate(self.photographs):
+            if each.mask is not None:
+                some = view == number
+                sure[some] = 2.0 * each.mask.reshape(-1)[index[some]] - 1
+        return sure
+
+    def _visible(
+        self, view: Int[Tensor, "n"], place: Similarity, points_object: Float[Tensor, "n 3"], sdf: SDF
+    ) -> tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]:
+        """Points, and the partners of their views that see them: from before, in their image, with nothing between."""
+        partner = self.partners[view]
+        row, column = (partner >= 0).nonzero().T
+        other = partner[row, column]
+        points, normal = points_object[row], normals(sdf, points_object)[row]
+        eyes = torch.stack([picture.camera.T_world_camera[:3, 3] for picture in self.pictures])[other]
+        to_eye = place.rays_in_object(Rays(eyes, eyes)).origins - points
+        rays = Rays(points, to_eye / to_eye.norm(dim=-1, keepdim=True))
+        seen = (rays.directions * normal).sum(-1) > FACING
+        for number, picture in enumerate(self.pictures):
+            some = other == number
+            seen[some] &= picture.shows(*picture.camera.project(place.to_world(points[some])))
+        row, other, rays = row[seen], other[seen], rays[seen]
+        leaving = Bounds(torch.full_like(rays.origins[:, 0], LEAVING), meet_sphere(rays).far)
+        clear = ~sphere_trace(sdf, rays, leaving, MARCH).hit
+        return row[clear], other[clear]

@@ -1,0 +1,193 @@
+"""Shapes from photographs, with an untrained decoder whose shapes are bumpy balls, painted."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import pytest
+import torch
+from bumpy import bumpy_balls
+from torch import Tensor
+
+from distrace.boundary import shade
+from distrace.camera import Camera
+from distrace.data.photograph import Photograph
+from distrace.decoder import Decoder
+from distrace.doubtful import agreements
+from distrace.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.photo_pairs import Colours, partners, without_light
+from distrace.photo_residuals import PhotoProblem, Shape
+from distrace.photo_stage import Comparing, Stage
+from distrace.pose import Similarity
+from distrace.prior import Prior
+from distrace.rays import Rays
+from distrace.regions import Regions
+from distrace.render import render
+
+PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
+TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
+GREY = torch.tensor([0.4, 0.45, 0.5])
+COMPARED = Comparing(rays=1500, partners=3, moves=False)
+CONFIG = PhotoConfig(iterations=12, starts=1, levels=(0.5, 0.5, 1.0, 1.0), compared=COMPARED)
+MEAN = Shape(torch.zeros(4), Similarity.identity())
+MOVED = Similarity.identity().moved(torch.tensor([0.05, -0.08, 0.04, 0.03, -0.02, 0.03, 0.05]))
+
+
+def ring(count: int = 10, size: int = 56) -> list[Camera]:
+    return [
+        Camera.orbit(360 * k / count, 10 + 15 * (k % 3), 2.8, height=size, width=size, focal_px=1.25 * size)
+        for k in range(count)
+    ]
+
+
+def paint(points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
+    waves = torch.tensor([[5.0, 3.0, -2.0], [-3.0, 6.0, 2.0], [2.0, -4.0, 7.0]])
+    return 0.5 + 0.2 * torch.sin(points @ waves) + 0.2 * torch.sin(2.1 * points @ waves.T + 1)
+
+
+@torch.no_grad()
+def photographs(decoder: Decoder, cameras: Sequence[Camera], place: Similarity | None = None) -> list[Photograph]:
+    """Of the true shape, painted in its own frame."""
+    place = place or Similarity.identity()
+    images = [shade(render(decoder.field(TRUE), place.camera_in_object(camera)), paint, GREY) for camera in cameras]
+    return [Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))]
+
+
+@pytest.fixture(scope="module")
+def decoder() -> Decoder:
+    return bumpy_balls()
+
+
+@pytest.fixture(scope="module")
+def views(decoder: Decoder) -> list[Photograph]:
+    return photographs(decoder, ring())
+
+
+@torch.no_grad()
+def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> float:
+    """Root mean square, over the surface of the true shape in its place, of the field of another in its own."""
+    points = torch.cat([render(decoder.field(TRUE), camera).points for camera in ring(6, 24)])
+    world = (place or Similarity.identity()).to_world(points)
+    there = shape.place.rays_in_object(Rays(world, world)).origins
+    return float(decoder.field(PRIOR.code(shape.w))(there).square().mean().sqrt())
+
+
+def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> Shape:
+    *_, last = fit_photos(decoder, views, PRIOR, config)
+    assert isinstance(last, PhotoStep)
+    return Shape(PRIOR.coordinates(last.code), last.place)
+
+
+def test_a_picture_has_its_pixels_at_their_centres_and_slopes_between() -> None:
+    camera = Camera.orbit(0, 0, 3, height=8, width=12)
+    x, y = camera.pixels().unbind(-1)
+    picture = Colours.of(torch.stack([0.03 * x, 0.05 * y, 0.01 * x - 0.02 * y], dim=-1), camera)
+    at = torch.tensor([[3.5, 2.5], [4.75, 3.1], [9.2, 5.9]])
+    values, slopes = picture.at(at)
+    torch.testing.assert_close(values[:, 0], 0.03 * at[:, 0])
+    torch.testing.assert_close(values[:, 1], 0.05 * at[:, 1])
+    torch.testing.assert_close(slopes, torch.tensor([[0.03, 0.0], [0.0, 0.05], [0.01, -0.02]]).expand(3, 3, 2))
+
+
+def test_projected_points_move_as_finite_differences_say() -> None:
+    camera = Camera.orbit(40, 25, 3, height=30, width=40, focal_px=50.0, dtype=torch.float64)
+    points = 0.3 * torch.randn(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    pixels, by_point = Colours(camera, torch.zeros(9, 30, 40)).projected(points)
+    torch.testing.assert_close(pixels, camera.project(points)[0])
+    for axis, step in enumerate(1e-6 * torch.eye(3, dtype=torch.float64)):
+        change = (camera.project(points + step)[0] - camera.project(points - step)[0]) / 2e-6
+        torch.testing.assert_close(by_point[..., axis].to(change), change, rtol=1e-5, atol=1e-6)
+
+
+def test_without_light_an_image_is_the_same_in_another_light() -> None:
+    image = torch.rand(40, 50, 3, generator=torch.Generator().manual_seed(0))
+    dimmed = 0.6 * image + 0.1
+    assert (without_light(dimmed) - without_light(image)).abs().max() < 0.15 * (dimmed - image).abs().max()
+
+
+def test_partners_are_neighbours_on_a_ring_and_none_is_opposite() -> None:
+    chosen = partners(ring(18), 4)
+    for view, others in enumerate(chosen.tolist()):
+        steps = {min((view - other) % 18, (other - view) % 18) for other in others}
+        assert steps <= {1, 2, 3}
+        assert view not in others
+    assert (partners(ring(3), 4) >= 0).sum(1).tolist() == [1, 1, 1], "too far apart, but there is no nearer one"
+
+
+def test_colours_seen_on_the_object_alone_are_its_own() -> None:
+    random = torch.Generator().manual_seed(0)
+    red, blue = (
+        torch.tensor(c) + 0.05 * torch.randn(500, 3, generator=random) for c in ([0.8, 0.2, 0.2], [0.2, 0.3, 0.8])
+    )
+    both = torch.cat([red, blue, blue, red[:50]]).clamp(0, 1)
+    is_object = torch.cat([torch.ones(500), torch.zeros(500), torch.ones(60), torch.zeros(490)]).bool()[: len(both)]
+    regions = Regions.of(both, is_object)
+    asked = torch.tensor([[0.8, 0.2, 0.2], [0.2, 0.3, 0.8], [0.5, 0.9, 0.1]])
+    assert regions.probability(asked[:1]) > 0.8
+    assert regions.probability(asked[2:]) == pytest.approx(0.5, abs=1e-3), "never seen"
+
+
+@pytest.mark.parametrize("kind", ["colour", "outline"])
+def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[Photograph], kind: str) -> None:
+    compared = replace(COMPARED, moves=True, rays=600)
+    shape, random = Shape(PRIOR.coordinates(TRUE) + 0.3, MOVED), torch.Generator().manual_seed(0)
+    problem, look = Stage.of(views, 1.0, compared).problem(decoder, PRIOR, shape, compared, random)
+    before = problem.residuals(look)
+    size = 3 * len(problem.pairs)
+    rows = torch.arange(len(before.values))
+    wanted = rows < size if kind == "colour" else (rows >= size) & (rows < size + int(look.wrong.sum()))
+    assert wanted.sum() > 30
+    direction = torch.randn(11, generator=random)
+    step = 2e-3 * direction / direction.norm()
+    ahead, behind = (changed(problem, shape, sign * step) for sign in (1, -1))
+    if kind == "outline":
+        same = ahead[1] & behind[1] & look.wrong
+        pick = same[look.wrong]
+        change = ahead[0].values[size : size + int(ahead[1].sum())][same[ahead[1]]]
+        change = change - behind[0].values[size : size + int(behind[1].sum())][same[behind[1]]]
+        expected = (before.jacobian @ (2 * step))[wanted][pick]
+    else:
+        change = ahead[0].values[:size] - behind[0].values[:size]
+        expected = (before.jacobian @ (2 * step))[wanted]
+    change, expected = change[expected != 0], expected[expected != 0]
+    off = (change - expected).abs()
+    assert off.median() < 0.15 * expected.abs().median(), "bilinear colours and flat facets: not every single one"
+
+
+def changed(problem: PhotoProblem, shape: Shape, step: Tensor) -> tuple:
+    look = problem.look(Shape(shape.w + step[:4], shape.place.moved(step[4:])))
+    return problem.residuals(look), look.wrong
+
+
+def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
+    assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
+
+
+def test_a_code_and_a_place_are_found_together(decoder: Decoder) -> None:
+    moved = photographs(decoder, ring(), MOVED)
+    config = replace(CONFIG, iterations=20, compared=replace(COMPARED, moves=True))
+    assert error(decoder, fitted(decoder, moved, config), MOVED) < 0.15 * error(decoder, MEAN, MOVED)
+
+
+def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:
+    camera = ring(1)[0]
+    inside = MOVED.camera_in_object(camera)
+    rays = MOVED.rays_in_object(camera.rays())
+    torch.testing.assert_close(inside.rays().origins, rays.origins)
+    torch.testing.assert_close(inside.rays().directions, rays.directions)
+    distance = torch.full(rays.shape, 2.0)
+    torch.testing.assert_close(MOVED.to_world(rays.at(distance)), camera.rays().at(MOVED.scale * distance))
+    matrix = MOVED.T_world_object
+    point = torch.tensor([0.1, 0.2, 0.3])
+    torch.testing.assert_close(matrix[:3, :3] @ point + matrix[:3, 3], MOVED.to_world(point))
+
+
+def test_a_view_whose_camera_is_wrong_is_told(decoder: Decoder, views: list[Photograph]) -> None:
+    wrong = [replace(view, camera=view.camera.turned(15.0)) if k == 4 else view for k, view in enumerate(views)]
+    shape = Shape(PRIOR.coordinates(TRUE), Similarity.identity())
+    assert [view.name for view in agreements(decoder, wrong, PRIOR, shape, COMPARED) if view.doubtful] == ["04"]
+    assert not any(view.doubtful for view in agreements(decoder, views, PRIOR, shape, COMPARED))
+
+
+def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) -> None:
+    with pytest.raises(ValueError, match="1 photographs were given"):
+        fit_photos(decoder, views[:1], PRIOR)
