@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 
 from distrace.camera import Camera
+from distrace.data.pictures import save_mask
 from distrace.data.split import Shape, on_side
 from distrace.errors import explained
 from distrace.files import save_json, written
@@ -111,7 +112,7 @@ def save_frame(
     """The image, and in `truth/` the mask (255 is the shape) and the depth z in float32, `inf` where nothing is."""
     with written(folder / f"truth/depth/{frame:03d}.npy") as file:
         np.save(file, depth)
-    save_png(folder / f"truth/masks/{frame:03d}.png", np.where(mask[..., None], [255] * 3, 0).astype(np.uint8))
+    save_mask(folder / f"truth/masks/{frame:03d}.png", torch.from_numpy(mask))
     save_png(folder / image_name(frame), image)
 
 
