@@ -46,6 +46,7 @@ ORDER = [
         "trials",
         "sparse_depth",
         "focal_test",
+        "multiview_table",
         "split_table",
         "spread_table",
         "page",

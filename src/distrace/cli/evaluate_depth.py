@@ -6,6 +6,8 @@ from functools import partial
 from pathlib import Path
 from statistics import median
 
+import tyro
+
 from distrace import depth_tables
 from distrace.cli.common import Meshes, show_table
 from distrace.cli.console import console, origin, progress, start
@@ -13,6 +15,8 @@ from distrace.data.split import CLASSES
 from distrace.files import save_text
 from distrace.focal_test import look_rows, looks
 from distrace.methods import METHODS
+from distrace.multiview_table import METHODS as METHODS_OF_CLIPS
+from distrace.multiview_table import ClipTrial, clip_done, described, multiview_rows, settings_of
 from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
 from distrace.spread_table import spread_rows
 from distrace.trials import each_done
@@ -115,6 +119,37 @@ class Spread:
         middle = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
         console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in middle.items()))
         run.finish({"rows": rows, "median_correlation": middle, **origin()})
+
+
+@dataclass(frozen=True)
+class Multiview:
+    """Held-out shapes from clips: ours, masks alone, and the best training shape. A second run goes on."""
+
+    clips: tyro.conf.Positional[tuple[Path, ...]]  # folders as `distrace clip` makes them
+    methods: tuple[str, ...] = METHODS_OF_CLIPS
+    model: str | None = None  # by default the bundled one of a clip's split
+    meshes: Meshes = Path("out")
+    out: Path = Path("out/evaluate")
+    jobs: int = 2  # processes
+
+    def run(self) -> None:
+        checked(self.jobs, len(self.clips))
+        for method in self.methods:
+            settings_of(method)
+        for folder in self.clips:
+            described(folder)
+        run, results = start(self.out), []
+        trials = [
+            ClipTrial(clip, method, self.meshes, run.out, self.model) for clip in self.clips for method in self.methods
+        ]
+        with progress("multiview", len(trials)) as bar:
+            for each in each_done(clip_done, trials, self.jobs):
+                results.append(each)
+                bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
+        results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))
+        rows = multiview_rows(results)
+        show_table([{key: row.get(key, "") for key in rows[-1] | rows[0]} for row in rows])
+        run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})
 
 
 def checked(jobs: int, shapes: int | None, views: int = 1) -> None:

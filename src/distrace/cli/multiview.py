@@ -29,7 +29,7 @@ from distrace.views_page import forming, views_page
 class Multiview:
     """Find a shape, and where it lies, from photographs with known cameras: no depth, no masks."""
 
-    model: ModelName
+    model: tyro.conf.Positional[ModelName]
     views: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIEWS")]]
     """a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/"""
     out: Path = Path("out/multiview")

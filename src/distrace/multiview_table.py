@@ -1,0 +1,177 @@
+"""Held-out shapes from clips of them, without depth and masks: against masks alone, and against the training shapes.
+
+The protocol is DIST's (Liu et al., CVPR 2020, section 4.3): cameras are known, the code is not; and beside it the
+shape's place, too, is off at first.
+"""
+
+import json
+import math
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.checkpoint import Model
+from distrace.data.photographs import Photograph, load_photographs
+from distrace.data.pictures import read_mask
+from distrace.data.view import View
+from distrace.errors import explained
+from distrace.files import save_json
+from distrace.fit_code import CodeFitConfig, fit_code
+from distrace.fit_photos import PhotoConfig, fit_photos, ranked
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.photo_stage import Comparing, Stage
+from distrace.pose import Similarity
+from distrace.prior import prior_of
+from distrace.sparse_depth import fingerprint, hash_of, true_solid
+from distrace.trials import opened_once, read_json
+
+METHODS = ("nearest", "silhouettes", "ours", "ours, moved")
+KNOWN_PLACE = PhotoConfig(compared=Comparing(moves=False))
+MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size
+RECOVERED = (1.0, 0.02, 0.02)  # to so much, the place counts as found again
+RESOLUTION = 192
+
+
+@dataclass(frozen=True)
+class ClipTrial:
+    """A clip as `distrace clip` leaves it, and who finds the shape in it."""
+
+    folder: Path
+    method: str
+    meshes: Path
+    out: Path
+    model: str | None = None  # by default that of the clip's split
+
+
+@dataclass(frozen=True)
+class ClipResult:
+    """How far the found surface is from the true one; and the place, where that had been moved."""
+
+    category: str
+    shape: str
+    background: str
+    texture: str
+    method: str
+    chamfer_to: float
+    chamfer_from: float
+    seconds: float
+    degrees: float
+    shift: float
+    growth: float
+    code: list[float]
+
+    @property
+    def chamfer(self) -> float:
+        return self.chamfer_to + self.chamfer_from
+
+    @property
+    def recovered(self) -> bool:
+        return all(off <= limit for off, limit in zip((self.degrees, self.shift, self.growth), RECOVERED, strict=True))
+
+    def row(self) -> dict[str, object]:
+        """All but the code."""
+        return {name: value for name, value in asdict(self).items() if name != "code"}
+
+
+def clip_done(trial: ClipTrial) -> ClipResult:
+    """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
+    clip = described(trial.folder)
+    model = opened_once(trial.model or clip["split"])
+    mark = fingerprint(model, clip["seed"], clip["frames"], clip["size"], clip["samples"], settings_of(trial.method))
+    path = trial.out / "trials" / f"{clip['shape']}_{clip['background']}_{trial.method}.json"
+    if path.is_file():
+        kept = read_json(path)
+        if kept.pop("made_by", None) == mark:
+            return ClipResult(**kept)
+    began = time.perf_counter()
+    code, off = _found(trial, model, clip)
+    seconds = time.perf_counter() - began
+    truth = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
+    distance = chamfer(extract_mesh(model.field(code), MeshConfig(RESOLUTION)), truth)
+    names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
+    result = ClipResult(*names, distance.to, distance.from_, seconds, *off, [round(x, 6) for x in code.tolist()])
+    save_json(path, {"made_by": mark, **asdict(result)})
+    return result
+
+
+def described(folder: Path) -> dict[str, Any]:
+    """What `clip.json` says; raises `ValueError` for a folder without one."""
+    path = folder / "clip.json"
+    with explained(f"{path} is no description of a clip; `distrace clip SHAPE` makes one"):
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+
+
+def settings_of(method: str) -> object:
+    """What a method follows; raises `ValueError` for another one."""
+    if method not in METHODS:
+        raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS)}")
+    return CodeFitConfig() if method == "silhouettes" else (method, KNOWN_PLACE, MOVED_BY)
+
+
+def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], tuple[float, ...]]:
+    """The code, and what the place is off by at the end: degrees, radii, and a part of the size."""
+    prior, nothing = prior_of(model.codes), (0.0, 0.0, 0.0)
+    views = list(load_photographs(trial.folder).views)
+    if trial.method == "silhouettes":
+        *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
+        return step.code, nothing
+    if trial.method == "nearest":
+        stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
+        best = ranked(model.decoder, stage, prior, KNOWN_PLACE.compared, Similarity.identity())[0]
+        return prior.code(best[1]), nothing
+    if trial.method == "ours":
+        *_, step = fit_photos(model.decoder, views, prior, KNOWN_PLACE)
+        return step.code, nothing
+    config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=True))
+    start = disturbed(hash_of(clip["shape"]))
+    *_, last = fit_photos(model.decoder, views, prior, config, start)
+    return last.code, _off(last.place)
+
+
+def disturbed(seed: int) -> Similarity:
+    """A place that is off by `MOVED_BY`, to all sides alike."""
+    random = torch.Generator().manual_seed(seed)
+    axis, shift = torch.nn.functional.normalize(torch.randn(2, 3, generator=random), dim=-1)
+    growth = torch.tensor([math.log1p(MOVED_BY[2])]) * (1 - 2 * torch.randint(2, (1,), generator=random))
+    step = torch.cat([axis * math.radians(MOVED_BY[0]), shift * MOVED_BY[1], growth])
+    return Similarity.identity().moved(step)
+
+
+def _off(place: Similarity) -> tuple[float, float, float]:
+    """From where the shape is: degrees, radii, and a part of its size."""
+    cosine = float(((place.rotation.trace() - 1) / 2).clamp(-1, 1))
+    return math.degrees(math.acos(cosine)), float(place.translation.norm()), abs(float(place.scale) - 1)
+
+
+def _silhouette(folder: Path, view: Photograph) -> View:
+    """The true mask of a frame, and nothing else."""
+    mask = read_mask(folder / "truth" / "masks" / f"{view.name}.png")
+    return View(view.camera, torch.full(mask.shape, torch.inf), mask)
+
+
+def multiview_rows(results: Sequence[ClipResult]) -> list[dict[str, object]]:
+    """Medians of each class, background and method."""
+    groups: dict[tuple, list[ClipResult]] = {}
+    for each in results:
+        groups.setdefault((each.category, each.background, each.method), []).append(each)
+    return [
+        {
+            "class": category,
+            "background": background,
+            "method": method,
+            "chamfer_from_truth": median(each.chamfer_from for each in some),
+            "chamfer": median(each.chamfer for each in some),
+            "seconds": median(each.seconds for each in some),
+            **({"recovered": sum(each.recovered for each in some) / len(some)} if "moved" in method else {}),
+            "n": len(some),
+        }
+        for (category, background, method), some in groups.items()
+    ]

@@ -1,0 +1,104 @@
+"""From a folder of photographs to a mesh by the command, and the table of clips, with painted bumpy balls."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from bumpy import bumpy_balls
+from test_fit_photos import GREY, TRUE, paint, ring
+
+from distrace import multiview_table
+from distrace.boundary import shade
+from distrace.camera import Camera
+from distrace.checkpoint import Model, save_model
+from distrace.cli import main
+from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
+from distrace.fit_photos import PhotoConfig
+from distrace.multiview_table import ClipResult, disturbed, multiview_rows, settings_of
+from distrace.render import render
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    random = torch.Generator().manual_seed(2)
+    codes = torch.cat([0.3 * torch.randn(4, 4, generator=random), torch.zeros(1, 4)])
+    save_model(tmp_path / "balls", Model("balls", bumpy_balls(), codes, tuple("abcde")), torch.float32)
+    return tmp_path / "balls"
+
+
+@torch.no_grad()
+def save_views(folder: Path, cameras: list[Camera]) -> None:
+    field = bumpy_balls().field(TRUE)
+    images = [shade(render(field, camera), paint, GREY) for camera in cameras]
+    views = [
+        Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
+    ]
+    save_photographs(folder, Photographs(tuple(views), Placement(torch.tensor([3.0, 0, 0]).double(), 2.0), "ours"))
+
+
+def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
+    tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    save_views(tmp_path / "views", ring(6, 40))
+    monkeypatch.setattr("distrace.cli.multiview.PhotoConfig", tiny)
+    out = tmp_path / "out"
+    given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed", "--rays", "500", "--resolution", "40"]
+    monkeypatch.setattr("sys.argv", ["distrace", "multiview", *given])
+    main()
+    wanted = {"mesh.ply", "code.npy", "report.html", "forming.gif", "result.json"}
+    assert {path.name for path in out.iterdir()} == wanted
+    result = json.loads((out / "result.json").read_text())
+    assert result["unit_sphere"] == {"centre": [3.0, 0.0, 0.0], "radius": 2.0}
+    assert np.allclose(result["T_unit_object"], np.eye(4))
+    assert np.load(out / "code.npy").shape == (4,)
+    mesh = trimesh.load(out / "mesh.ply")
+    assert mesh.centroid == pytest.approx([3.0, 0, 0], abs=0.8)
+    assert 1.0 < mesh.extents.max() < 4.0
+
+
+def tiny(**given: object) -> PhotoConfig:
+    return PhotoConfig(**(given | {"iterations": 2, "starts": 1, "levels": (0.5, 1.0)}))  # pyright: ignore[reportArgumentType]
+
+
+def test_a_folder_without_views_ends_in_one_sentence(
+    tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "empty").mkdir()
+    monkeypatch.setattr(
+        "sys.argv", ["distrace", "multiview", str(model), str(tmp_path / "empty"), "--out", str(tmp_path)]
+    )
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    error = capsys.readouterr().err
+    assert "holds no photographs with cameras" in error
+    assert error.count("\n") == 1
+
+
+def test_a_disturbed_place_is_off_by_what_is_said() -> None:
+    for seed in range(4):
+        place = disturbed(seed)
+        degrees, shift, growth = multiview_table._off(place)
+        assert degrees == pytest.approx(10, abs=0.01)
+        assert shift == pytest.approx(0.1, abs=1e-5)
+        assert growth == pytest.approx(0.1, abs=1e-5) or growth == pytest.approx(1 - 1 / 1.1, abs=1e-5)
+
+
+def test_rows_are_medians_of_each_class_background_and_method() -> None:
+    def result(method: str, chamfer: float, degrees: float) -> ClipResult:
+        return ClipResult("sofas", "s", "plain", "own", method, chamfer, 2 * chamfer, 1.0, degrees, 0.0, 0.0, [])
+
+    found = multiview_rows(
+        [result("ours", 1, 0), result("ours", 3, 0), result("ours, moved", 1, 0.5), result("ours, moved", 1, 4)]
+    )
+    assert [(row["method"], row["chamfer"], row["n"]) for row in found] == [("ours", 6, 2), ("ours, moved", 3, 2)]
+    assert found[1]["recovered"] == 0.5
+    assert "recovered" not in found[0]
+
+
+def test_unknown_methods_are_refused() -> None:
+    with pytest.raises(ValueError, match="no method 'guess'"):
+        settings_of("guess")
