@@ -13,7 +13,7 @@ from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.doubtful import agreements
-from distrace.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.fit_photos import PhotoConfig, fit_photos
 from distrace.photo_pairs import Colours, partners, without_light
 from distrace.photo_residuals import PhotoProblem, Shape
 from distrace.photo_stage import Comparing, Stage
@@ -73,7 +73,6 @@ def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> fl
 
 def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> Shape:
     *_, last = fit_photos(decoder, views, PRIOR, config)
-    assert isinstance(last, PhotoStep)
     return Shape(PRIOR.coordinates(last.code), last.place)
 
 

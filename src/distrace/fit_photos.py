@@ -61,8 +61,8 @@ def fit_photos(
     prior: Prior,
     config: PhotoConfig = PhotoConfig(),
     place: Similarity | None = None,
-) -> Iterator[Step]:
-    """Fits a shape to photographs whose cameras see the unit sphere. The last step, a `PhotoStep`, is the result.
+) -> Iterator[PhotoStep]:
+    """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
     place; the one whose loss falls lowest goes on. Raises `ValueError` for fewer than two photographs.

@@ -116,7 +116,9 @@ def settings_of(method: str) -> object:
     return CodeFitConfig() if method == "silhouettes" else (method, KNOWN_PLACE, MOVED_BY)
 
 
-def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], tuple[float, ...]]:
+def _found(
+    trial: ClipTrial, model: Model, clip: dict[str, Any]
+) -> tuple[Float[Tensor, "length"], tuple[float, float, float]]:
     """The code, and what the place is off by at the end: degrees, radii, and a part of the size."""
     prior, nothing = prior_of(model.codes), (0.0, 0.0, 0.0)
     views = list(load_photographs(trial.folder).views)

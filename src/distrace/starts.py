@@ -1,8 +1,9 @@
 """Fitting from several starts, because a loss has many valleys: all are tried, the best goes on alone."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TypeVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -47,13 +48,16 @@ class Step:
     evaluations: int = 0  # of the field
 
 
-def best_of(starts: Starts, run: Callable[[int], Iterator[Step]], recent: int = RECENT) -> Iterator[Step]:
+Stepped = TypeVar("Stepped", bound=Step)
+
+
+def best_of(starts: Starts, run: Callable[[int], Iterator[Stepped]], recent: int = RECENT) -> Iterator[Stepped]:
     """The steps of all trials, then those of the start whose last losses are the least; the last step is the result."""
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
         yield from runs[0]
         return
-    trials: list[list[Step]] = []
+    trials: list[list[Stepped]] = []
     for going in runs:
         trials.append([])
         for step in islice(going, starts.tried):
@@ -64,5 +68,5 @@ def best_of(starts: Starts, run: Callable[[int], Iterator[Step]], recent: int = 
     yield from runs[best]
 
 
-def _mean_loss(steps: list[Step]) -> float:
+def _mean_loss(steps: Sequence[Step]) -> float:
     return sum(step.loss for step in steps) / len(steps)

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, cast
+from typing import Annotated
 
 import numpy as np
 import torch
@@ -81,7 +81,7 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> l
     steps: list[PhotoStep] = []
     with progress("fitting", config.total) as bar:
         for step in fit_photos(model.decoder, views, prior_of(model.codes), config):
-            steps.append(cast(PhotoStep, step))
+            steps.append(step)
             bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
     return steps
 
