@@ -61,8 +61,14 @@ def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
 
 
 def ball(layers: int, width: int) -> SDF:
-    """A network that is about the distance to a sphere before any training (Atzmon and Lipman, *SAL*, CVPR 2020)."""
-    decoder = Decoder(NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=()))
+    """The field of a network before any training."""
+    specs = NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=())
+    return ball_decoder(specs, RADIUS).field(torch.zeros(1))
+
+
+def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
+    """About the distance to a sphere before any training (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+    decoder = Decoder(specs)
     generator = torch.Generator().manual_seed(0)
     linears = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
     with torch.no_grad():
@@ -70,8 +76,8 @@ def ball(layers: int, width: int) -> SDF:
             linear.weight.normal_(0, (2 / linear.out_features) ** 0.5, generator=generator)
             linear.bias.zero_()
         linears[-1].weight.normal_((torch.pi / linears[-1].in_features) ** 0.5, 1e-5, generator=generator)
-        linears[-1].bias.fill_(-RADIUS)
-    return decoder.requires_grad_(False).field(torch.zeros(1))
+        linears[-1].bias.fill_(-radius)
+    return decoder.requires_grad_(False)
 
 
 def _rows(

@@ -48,13 +48,15 @@ class Stage:
     photographs: Sequence[Photograph]
     pictures: Sequence[Colours]  # what is compared of them
     partners: Int[Tensor, "views count"]  # to compare each view with; -1 where there are fewer
+    meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
 
     @staticmethod
     def of(photographs: Sequence[Photograph], level: float, config: Comparing) -> "Stage":
         coarse = [photograph.resized(level) for photograph in photographs]
         images = [each.image if config.same_light else without_light(each.image) for each in coarse]
         pictures = [Colours.of(image, each.camera) for image, each in zip(images, coarse, strict=True)]
-        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners))
+        meets = [meet_sphere(each.camera.rays()).meets.reshape(-1) for each in coarse]
+        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners), meets)
 
     @torch.no_grad()
     def problem(
@@ -62,8 +64,9 @@ class Stage:
     ) -> tuple[PhotoProblem, Look]:
         """Rays drawn anew, what their pixels show by what is known so far, and who else sees it."""
         view, index = self._drawn(config.rays, random)
-        rays, colours = self._read(view, index, [each.image for each in self.photographs])
-        _, compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
+        rays = self._rays(view, index)
+        colours = self._read(view, index, [each.image for each in self.photographs])
+        compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
         in_object, sdf = shape.place.rays_in_object(rays), decoder.field(prior.code(shape.w))
         trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
         sure = self._certainty(view, index, colours, trace.hit)
@@ -81,35 +84,34 @@ class Stage:
     def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
         """As many pixels of each view, of those whose rays meet the unit sphere."""
         share = -(-count // len(self.photographs))
-        chosen = [drawn(self._meets(number).nonzero()[:, 0], share, random) for number in range(len(self.photographs))]
+        chosen = [drawn(meets.nonzero()[:, 0], share, random) for meets in self.meets]
         return torch.cat([torch.full_like(some, number) for number, some in enumerate(chosen)]), torch.cat(chosen)
 
-    def _meets(self, number: int) -> Bool[Tensor, "pixels"]:
-        return meet_sphere(self.photographs[number].camera.rays()).meets.reshape(-1)
+    def _rays(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"]) -> Rays:
+        """Of pixels, view by view."""
+        cameras = [each.camera for each in self.photographs]
+        parts = [
+            camera.rays(camera.pixels().reshape(-1, 2)[index[view == number]]) for number, camera in enumerate(cameras)
+        ]
+        return Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
 
     def _read(
         self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], images: Sequence[Float[Tensor, "height width channels"]]
-    ) -> tuple[Rays, Float[Tensor, "n channels"]]:
-        """The rays of pixels, view by view, and what images have there."""
-        origins, directions, colours = [], [], []
-        for number, (each, image) in enumerate(zip(self.photographs, images, strict=True)):
-            chosen = index[view == number]
-            rays = each.camera.rays(each.camera.pixels().reshape(-1, 2)[chosen])
-            origins.append(rays.origins)
-            directions.append(rays.directions)
-            colours.append(image.reshape(-1, image.shape[-1])[chosen])
-        return Rays(torch.cat(origins), torch.cat(directions)), torch.cat(colours)
+    ) -> Float[Tensor, "n channels"]:
+        """What images have at pixels, view by view."""
+        parts = [image.reshape(-1, image.shape[-1])[index[view == number]] for number, image in enumerate(images)]
+        return torch.cat(parts)
 
     def _certainty(
         self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], colours: Float[Tensor, "n 3"], hit: Bool[Tensor, "n"]
     ) -> Float[Tensor, "n"]:
         """By the masks where there are some, otherwise by colours: those of hits against all others."""
-        beyond = [each.image.reshape(-1, 3)[~self._meets(k)] for k, each in enumerate(self.photographs)]
+        beyond = [each.image.reshape(-1, 3)[~meets] for each, meets in zip(self.photographs, self.meets)]
         background = torch.cat([colours[~hit], *beyond])
         is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
         regions = Regions.of(torch.cat([colours[hit], background]), is_object)
         images = [2 * regions.smooth_probability(each.image)[..., None] - 1 for each in self.photographs]
-        sure = self._read(view, index, images)[1][:, 0]
+        sure = self._read(view, index, images)[:, 0]
         sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
         for number, each in enumerate(self.photographs):
             if each.mask is not None:

@@ -133,7 +133,7 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
         else:
             own.weight.copy_(learnt.weight)
         own.bias.copy_(learnt.bias)
-    known = {shape: code for shape, code in zip(model.shapes, model.codes, strict=True)}
+    known = dict(zip(model.shapes, model.codes, strict=True))
     training.codes.copy_(torch.stack([known.get(name, model.codes.mean(0)) for name in names]))
 
 

@@ -41,9 +41,7 @@ def views_page(
         losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
     cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.doubtful else ""] for view in agreed]
     lead = f"A shape from {len(views)} photographs, by the model {model.name}. No depth was known."
-    about = (
-        "How far colours are from those of the same points in other views, and pixels on the wrong side of outlines."
-    )
+    about = "How far colours, from 0 to 1, are from those of the same points in other views: the median."
     return page(
         "A shape from photographs",
         lead,
