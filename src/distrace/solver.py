@@ -28,7 +28,7 @@ def cauchy(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tenso
 def charbonnier(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
     """Far residuals count by their absolute values: as robust as a convex loss can be."""
     root = (1 + squared).sqrt()
-    return 2 * (root - 1), 1 / root
+    return 2 * squared / (1 + root), 1 / root  # 2 (√(1 + x) − 1), but exact where 1 + x rounds to 1
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from distrace.cli.evaluate import Evaluate
 from distrace.cli.gradients import CheckGradients
 from distrace.cli.multiview import Multiview
 from distrace.cli.pose import Pose
+from distrace.cli.reconstruct import Reconstruct
 from distrace.cli.show import Mesh, Render
 from distrace.cli.train import Train
 
@@ -27,6 +28,7 @@ COMMANDS = {
     "complete": Complete,
     "pose": Pose,
     "multiview": Multiview,
+    "reconstruct": Reconstruct,
     "data": Data,
     "sample": Sample,
     "clip": Clip,
@@ -44,7 +46,8 @@ def main() -> None:
         _run(sys.argv[1:])
     except KeyboardInterrupt:
         _end(
-            "stopped; what is written is whole, and train, sample, clip and most tables of evaluate go on from there",
+            "stopped; what is written is whole; train, reconstruct, sample, clip and most tables of evaluate go on from"
+            " there",
             130,
         )
     except (ValueError, OSError) as error:

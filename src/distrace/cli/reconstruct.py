@@ -1,0 +1,169 @@
+"""`reconstruct`: shape and colours of any object from photographs with masks or a dark background; no model needed."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import torch
+import tyro
+from PIL import Image
+
+from distrace.cli.common import Flag, save_mesh
+from distrace.cli.console import Run, console, device_name, progress, start
+from distrace.data.dark import masked
+from distrace.data.photograph import Photograph
+from distrace.data.photographs import Photographs, load_photographs, notes
+from distrace.files import save_json, save_text
+from distrace.mesh import MeshConfig
+from distrace.movie import save_gif
+from distrace.reconstruct import COURSE, ReconstructConfig, Reconstruction, reconstruct
+from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.shading import grid, save_png
+from distrace.surface_network import SurfaceSpecs
+
+TOLD = 4  # views that were fitted to, on the page
+PREVIEWS = 40  # of a run, evenly over its steps; they make its film
+PREVIEWED = 160  # pixels along the longer side
+
+
+@dataclass(frozen=True)
+class Reconstruct:
+    """Find shape and colours of any object from photographs with known cameras, by the weights of a network.
+
+    They need masks, or a dark background. Run it again to go on after a stop.
+    """
+
+    views: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIEWS")]]
+    """a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/"""
+    out: Path = Path("out/reconstruct")
+    steps: int = ReconstructConfig.steps
+    sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
+    rays: int = ReconstructConfig.rays  # of each step
+    width: int = SurfaceSpecs.width  # of both networks
+    silhouettes_only: Flag = False  # colours do not shape the surface: a visual hull, painted
+    held_out: int = 8  # one view in so many is not fitted to, but compared; 0 for none
+    resolution: int = 256  # of the mesh
+    seed: int = 0
+    save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
+    device: str = "cpu"
+
+    def run(self) -> None:
+        torch.set_flush_denormal(True)
+        run = start(self.out, self.device)
+        found = masked(load_photographs(self.views))
+        for note in notes(found):
+            console.print(note, markup=False)
+        told, kept_back = parted(found.views, self.held_out)
+        state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
+        made = Made(self.views.name, state, self.config, found, told, kept_back)
+        made.save(run, MeshConfig(self.resolution, device=run.device))
+
+    @property
+    def config(self) -> ReconstructConfig:
+        config = ReconstructConfig(steps=self.steps, sizes=self.sizes, rays=self.rays, seed=self.seed)
+        return replace(config, colours_shape=not self.silhouettes_only)
+
+    @property
+    def specs(self) -> SurfaceSpecs:
+        return SurfaceSpecs(width=self.width)
+
+
+def parted(views: Sequence[Photograph], every: int) -> tuple[list[Photograph], list[Photograph]]:
+    """Views to fit to, and one in so many to compare. Raises `ValueError` where fewer than two are left."""
+    if every < 0:
+        raise ValueError(f"--held-out {every} was given; one view in so many is held out, 0 for none")
+    apart = set(range(every // 2 - 1, len(views), every)) if every > 1 else set()
+    told = [view for number, view in enumerate(views) if number not in apart]
+    if every == 1 or len(told) < 2:
+        raise ValueError(
+            f"--held-out {every} leaves too few of {len(views)} views to fit to; give a larger number, or 0"
+        )
+    return told, [views[number] for number in sorted(apart)]
+
+
+def fitted(
+    run: Run,
+    views: Sequence[Photograph],
+    shown: Photograph,
+    config: ReconstructConfig,
+    specs: SurfaceSpecs,
+    save_every: float,
+) -> Reconstruction:
+    """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
+    names = [view.name for view in views]
+    state = load_reconstruction(run.out, config, specs, names, run.device)
+    if state.step:
+        console.print(f"going on from step {state.step} of {config.steps}")
+    save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
+    saved, due = time.perf_counter(), -(-config.steps // PREVIEWS)
+    with progress("reconstructing", config.steps) as bar:
+        for step in reconstruct(views, state, config):
+            bar.advance(", ".join(f"{name} {value:.4f}" for name, value in state.course[-1].items()), to=step.step)
+            if step.step % due == 0:
+                small = judged(state, shown, PREVIEWED)
+                save_png(run.out / "previews" / f"{step.step:07d}.png", small.picture)
+            if time.perf_counter() - saved > save_every:
+                save_reconstruction(run.out, state, config, names)
+                saved = time.perf_counter()
+    save_reconstruction(run.out, state, config, names)
+    return state
+
+
+@dataclass(frozen=True)
+class Made:
+    """A finished reconstruction, and what it was made from."""
+
+    name: str
+    state: Reconstruction
+    config: ReconstructConfig
+    found: Photographs
+    told: Sequence[Photograph]
+    kept_back: Sequence[Photograph]
+
+    def judged(self) -> list[Judged]:
+        """The views that were held out, in the size that was fitted last."""
+        return [judged(self.state, view, self.config.sizes[-1]) for view in self.kept_back]
+
+    def save(self, run: Run, config: MeshConfig) -> None:
+        """Mesh in the folder's world, page, film and `result.json`."""
+        mesh = coloured_mesh(self.state, config)
+        held_out = self.judged()
+        some = [judged(self.state, view, self.config.sizes[-1]) for view in self.told[:: -(-len(self.told) // TOLD)]]
+        facts = {
+            "views": f"{len(self.told)}, and {len(held_out)} held out",
+            "steps": f"{self.state.step:,} of {self.config.rays} rays",
+            "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
+            "evaluations of the surface": f"{self.state.evaluations:,}",
+            "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
+        }
+        course = self.state.course
+        save_text(run.out / "report.html", reconstruction_page(self.name, held_out, some, course, COURSE, mesh, facts))
+        if held_out:
+            save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
+        _save_film(run.out)
+        vertices = torch.from_numpy(np.asarray(mesh.vertices))
+        mesh.vertices = self.found.placement.to_world(vertices).numpy()
+        save_mesh(run.out / "mesh.ply", mesh)
+        placement = self.found.placement
+        sphere = {"centre": placement.centre.tolist(), "radius": placement.radius}
+        rows = [row_of(self.name, self.method, held_out, self.state.seconds)] if held_out else []
+        views = {view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out}
+        counted = {"evaluations": self.state.evaluations, "setup_evaluations": 0}
+        run.finish({"rows": rows, "held_out": views, "unit_sphere": sphere, "steps": self.state.step, **counted})
+        for row in rows:
+            console.print(f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}")
+
+    @property
+    def method(self) -> str:
+        return "ours" if self.config.colours_shape else "hull"
+
+
+def _save_film(folder: Path) -> None:
+    """The previews, one after the other."""
+    pictures = [np.asarray(Image.open(path).convert("RGB")) for path in sorted((folder / "previews").glob("*.png"))]
+    if pictures:
+        save_gif(folder / "forming.gif", np.stack(pictures))

@@ -1,0 +1,81 @@
+"""Masks of an object that was photographed before a dark background: whatever is not the background's colours."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from skimage.filters import gaussian, threshold_li
+from skimage.measure import label
+from skimage.morphology import disk, opening, remove_small_holes
+
+from distrace.data.carving import within_masks
+from distrace.data.photographs import Photographs
+from distrace.data.placement import Placement
+
+DARK = 0.15  # brightness that most pixels along the edges of the images stay below
+SAMPLED = 200_000  # pixels that tell the background's colours
+NOISE = 1 / 255  # standard deviation of a colour, at least
+THREAD = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
+HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows
+
+
+def masked(photographs: Photographs) -> Photographs:
+    """Photographs with masks: those that they have, or what stands out from a dark background.
+
+    Of these the unit sphere is put around what the masks allow. Raises `ValueError` where some have no mask and the
+    background is not dark.
+    """
+    views = photographs.views
+    if all(view.mask is not None for view in views):
+        return photographs
+    without = [view.name for view in views if view.mask is None]
+    edges = np.concatenate([_edge(view.image.amax(-1).numpy()) for view in views])
+    if np.median(edges) > DARK:
+        raise ValueError(
+            f"{without[0]} and {len(without) - 1} others have no mask, and their background is not dark: half of the"
+            f" pixels along the edges are brighter than {np.median(edges):.2f}; give masks, white where the object is"
+        )
+    masks = dark_masks([view.image for view in views])
+    told = tuple(replace(view, mask=mask) for view, mask in zip(views, masks, strict=True))
+    return _placed_again(Photographs(told, photographs.placement, photographs.layout))
+
+
+def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torch.Tensor, "_ _"]]:
+    """What stands out from the background of all images together: the largest part of each.
+
+    Distances from the mean colour of what is dark are measured in its standard deviations (Mahalanobis, 1936), so that
+    cloth that catches some light is still background, for it is grey. Both thresholds are Li's (Li and Tam, Pattern
+    Recognition Letters 1998).
+    """
+    colours = np.concatenate([image.numpy().reshape(-1, 3) for image in images])
+    colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
+    bright = colours.max(-1)
+    dark = colours[bright < threshold_li(bright)]
+    whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
+    apart = np.linalg.norm((colours - dark.mean(0)) @ whiten.T, axis=-1)
+    threshold = threshold_li(apart)
+    return [torch.from_numpy(_stands_out(image.numpy(), dark.mean(0), whiten, threshold)) for image in images]
+
+
+def _stands_out(image: np.ndarray, mean: np.ndarray, whiten: np.ndarray, threshold: float) -> np.ndarray:
+    smooth = gaussian(image, 1.0, channel_axis=-1)
+    apart = np.linalg.norm((smooth - mean) @ whiten.T, axis=-1)
+    parts = np.asarray(label(opening(apart > threshold, disk(THREAD))))
+    largest = parts == (1 + np.bincount(parts.ravel())[1:].argmax() if parts.any() else -1)
+    return np.asarray(remove_small_holes(largest, max_size=round(HOLE * parts.size)))
+
+
+def _edge(image: np.ndarray) -> np.ndarray:
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def _placed_again(photographs: Photographs) -> Photographs:
+    """In the sphere around what the masks allow."""
+    views, before = photographs.views, photographs.placement
+    cameras, masks = [view.camera for view in views], [view.mask for view in views if view.mask is not None]
+    sphere = within_masks(cameras, masks)
+    placed = tuple(replace(view, camera=sphere.camera_to_unit(view.camera)) for view in views)
+    there = Placement(before.to_world(sphere.centre), before.radius * sphere.radius)
+    return Photographs(placed, there, photographs.layout)

@@ -1,0 +1,123 @@
+"""What a reconstruction looks like beside photographs that it was not told: pictures, figures, a page."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import mean
+
+import numpy as np
+import torch
+import trimesh
+from torch.nn import functional as F
+
+from distrace.charts import curves
+from distrace.data.photograph import Photograph
+from distrace.field import value_and_gradient
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.page import Html, figure, page, paragraph, section, table
+from distrace.reconstruct import Reconstruction, coloured
+from distrace.render import Buffers, render
+from distrace.scene import scene
+from distrace.shading import Picture, mask_comparison, normal_picture, side_by_side
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A photograph and its rendering: how far apart they are, and how they look side by side."""
+
+    name: str
+    psnr: float  # in decibels, over the pixels of the photograph's mask; object that is missing counts as black
+    silhouette_iou: float
+    picture: Picture  # the photograph, the rendering, its normals, the masks
+
+
+@torch.no_grad()
+def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
+    """Renders the object as a photograph's camera sees it, with `size` pixels along the longer side.
+
+    Raises `ValueError` for a photograph without a mask.
+    """
+    if photograph.mask is None:
+        raise ValueError(f"{photograph.name} has no mask; without one nothing says where to compare it")
+    view = photograph.resized(min(1.0, size / max(photograph.mask.shape)))
+    assert view.mask is not None
+    buffers, made = seen(state, view)
+    hit, mask, image = buffers.mask.cpu(), view.mask, view.image
+    error = (made - image)[mask].square().mean().clamp_min(1e-10)
+    union = (hit | mask).sum().clamp_min(1)
+    pictures = [
+        _picture(torch.where(mask[..., None], image, 0.4 * image)),
+        _picture(torch.where(hit[..., None], made, 1.0)),
+        normal_picture(buffers.normal, buffers.mask, view.camera.T_world_camera),
+        mask_comparison(mask, hit),
+    ]
+    return Judged(
+        photograph.name, -10 * math.log10(float(error)), float((hit & mask).sum() / union), side_by_side(pictures)
+    )
+
+
+@torch.no_grad()
+def seen(state: Reconstruction, view: Photograph) -> tuple[Buffers, torch.Tensor]:
+    """The surface before a photograph's camera, and its colours: black where it is not hit."""
+    buffers = render(state.surface, view.camera.to(state.surface.last.weight.device))
+    made = torch.zeros_like(buffers.rays.directions)
+    made[buffers.mask] = coloured(state.surface, state.colour, buffers.points, buffers.rays.directions[buffers.mask])
+    return buffers, made.cpu()
+
+
+@torch.no_grad()
+def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
+    """The surface as triangles; each vertex has the colour that it shows when looked at from straight above."""
+    mesh = extract_mesh(state.surface, config)
+    vertices = torch.from_numpy(np.asarray(mesh.vertices)).float().to(config.device)
+    parts = []
+    for points in vertices.split(1 << 16):
+        _, gradient = value_and_gradient(state.surface, points)
+        parts.append(coloured(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
+    colours = (255 * torch.cat(parts)).round().byte().cpu().numpy()
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+
+
+def row_of(name: str, method: str, views: Sequence[Judged], seconds: float) -> dict[str, object]:
+    """A row of the table of photographs: means over views that were held out."""
+    return {
+        "object": name,
+        "method": method,
+        "psnr": round(mean(view.psnr for view in views), 2),
+        "silhouette_iou": round(mean(view.silhouette_iou for view in views), 4),
+        "views_held_out": len(views),
+        "seconds": round(seconds),
+    }
+
+
+def reconstruction_page(
+    name: str,
+    held_out: Sequence[Judged],
+    told: Sequence[Judged],
+    course: Sequence[Mapping[str, float]],
+    every: int,
+    mesh: trimesh.Trimesh,
+    facts: Mapping[str, str],
+) -> str:
+    """Views that were held out, some that were not, the mesh, and the course of the loss."""
+    about = "The photograph, what is not object dimmed; the rendering; its normals; masks, orange missing, blue extra."
+    terms = {term: [float(each[term]) for each in course] for term in (course[0] if course else {})}
+    return page(
+        f"{name} from photographs",
+        "A surface and its colours, as the weights of two networks: sphere-traced, with exact gradients.",
+        [
+            *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
+            section("Views it was fitted to", *map(_shown, told)),
+            section("In space", scene({"Surface": mesh}, {})),
+            section("Course", curves(terms, f"× {every} steps", "mean of a term", True)),
+            section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
+        ],
+    )
+
+
+def _shown(view: Judged) -> Html:
+    return figure(view.picture, f"{view.name}: {view.psnr:.1f} dB, intersection over union {view.silhouette_iou:.3f}")
+
+
+def _picture(image: torch.Tensor) -> Picture:
+    return (255 * image.clamp(0, 1)).round().to(torch.uint8).numpy()

@@ -1,0 +1,192 @@
+"""Weights fitted to photographs: of painted bumpy balls, whose shape and colours are known."""
+
+import json
+from copy import deepcopy
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import trimesh
+from bumpy import bumpy_balls
+from test_fit_photos import TRUE, paint, ring
+from torch.nn import functional as F
+
+from distrace.boundary import shade
+from distrace.cli import main
+from distrace.cli.reconstruct import parted
+from distrace.data.dark import masked
+from distrace.data.photograph import Photograph
+from distrace.data.photographs import Photographs, Placement, save_photographs
+from distrace.field import value_and_gradient
+from distrace.rays import Rays, meet_sphere
+from distrace.reconstruct import MARCH, Pixels, ReconstructConfig, Reconstruction, _colour_term, coloured, reconstruct
+from distrace.reconstruction_page import judged
+from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.render import render
+from distrace.surface import attach
+from distrace.surface_network import SurfaceNetwork, SurfaceSpecs, squareplus
+from distrace.trace import sphere_trace
+
+BLACK = torch.zeros(3)
+CPU = torch.device("cpu")
+SMALL = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4, colour_layers=2)
+SHORT = ReconstructConfig(steps=150, sizes=(32,), rays=256, learning_rate=2e-3)
+
+
+@pytest.fixture(scope="module")
+def views() -> list[Photograph]:
+    field, made = bumpy_balls().field(TRUE), []
+    for number, camera in enumerate(ring(8, 40)):
+        with torch.no_grad():
+            buffers = render(field, camera)
+            made.append(Photograph(f"{number:02}", camera, shade(buffers, paint, BLACK), buffers.mask))
+    return made
+
+
+@pytest.fixture(scope="module")
+def fitted(views: list[Photograph]) -> Reconstruction:
+    state = Reconstruction.fresh(SMALL, SHORT, CPU)
+    list(reconstruct(views[1:], state, SHORT))
+    return state
+
+
+def test_a_surface_begins_as_a_ball() -> None:
+    torch.manual_seed(0)
+    surface = SurfaceNetwork(SurfaceSpecs(radius=0.5))
+    directions = F.normalize(torch.randn(200, 3), dim=-1)
+    value, gradient = value_and_gradient(surface, 0.5 * directions)
+    assert value.abs().max() < 0.3
+    assert (gradient * directions).sum(-1).mean() > 0.8
+
+
+def test_squareplus_is_smooth_and_close_to_relu() -> None:
+    x = torch.linspace(-1, 1, 201, dtype=torch.float64, requires_grad=True)
+    assert (squareplus(x) - x.relu()).abs().max() < 0.0071  # IDR's softplus: log 2 / 100
+    assert torch.autograd.gradcheck(squareplus, x)
+    assert torch.autograd.gradgradcheck(squareplus, x)
+
+
+def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted: Reconstruction) -> None:
+    before = judged(Reconstruction.fresh(SMALL, SHORT, CPU), views[0], 40)
+    after = judged(fitted, views[0], 40)
+    assert after.silhouette_iou > max(0.9, before.silhouette_iou)
+    assert after.psnr > before.psnr + 3
+    assert fitted.evaluations > SHORT.steps * SHORT.rays
+    assert len(fitted.course) == 2
+    assert fitted.course[-1]["colour"] < fitted.course[0]["colour"]
+
+
+def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reconstruction) -> None:
+    """The derivatives of colours by the surface's last bias agree with those of rays traced anew."""
+    surface, colour = deepcopy(fitted.surface).double(), deepcopy(fitted.colour).double()
+    rays, bias = Pixels.of(views[1:3], 40).rays, surface.last.bias
+    rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
+    march = replace(MARCH, tolerance=1e-10, steps=400, step_scale=0.8)
+    trace = sphere_trace(surface, rays, meet_sphere(rays), march)
+    rays, distance = rays[trace.hit], trace.distance[trace.hit]
+    red = coloured(surface, colour, rays.at(attach(surface, rays, distance)), rays.directions)[::29, 0]
+    exact = torch.stack([torch.autograd.grad(each, bias, retain_graph=True)[0][0] for each in red])
+    few, step, found = Rays(rays.origins[::29], rays.directions[::29]), 1e-5, []
+    for sign in (1, -1):
+        with torch.no_grad():
+            bias[0] += sign * step
+            again = sphere_trace(surface, few, meet_sphere(few), march).distance
+            found.append(coloured(surface, colour, few.at(again), few.directions)[:, 0])
+            bias[0] -= sign * step
+    off = ((found[0] - found[1]) / (2 * step) - exact).abs()
+    assert off.median() < 1e-7
+    assert off.quantile(0.95) < 1e-5  # between them are kinks of the colours' network, which are ReLU's
+
+
+def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
+    config = replace(SHORT, colours_shape=False)
+    state = Reconstruction.fresh(SMALL, config, CPU)
+    pixels = Pixels.of(views, 32)
+    trace = sphere_trace(state.surface, pixels.rays, meet_sphere(pixels.rays), MARCH)
+    _colour_term(pixels, trace, trace.hit & pixels.is_object, state, False).backward()
+    assert all(weight.grad is None for weight in state.surface.parameters())
+    assert any(weight.grad is not None for weight in state.colour.parameters())
+
+
+def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:
+    config, names = replace(SHORT, steps=12, sizes=(16, 32)), [view.name for view in views]
+    whole = Reconstruction.fresh(SMALL, config, CPU)
+    list(reconstruct(views, whole, config))
+    half = Reconstruction.fresh(SMALL, config, CPU)
+    for step in reconstruct(views, half, config):
+        if step.step == 5:
+            break
+    save_reconstruction(tmp_path, half, config, names)
+    again = load_reconstruction(tmp_path, config, SMALL, names, CPU)
+    assert again.step == 5
+    list(reconstruct(views, again, config))
+    for one, other in zip(whole.surface.parameters(), again.surface.parameters()):
+        assert torch.equal(one, other)
+    with pytest.raises(ValueError, match="other rays, width; give the same, or another --out"):
+        load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), names, CPU)
+    (tmp_path / "checkpoint.pt").write_bytes(b"no")
+    with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
+        load_reconstruction(tmp_path, config, SMALL, names, CPU)
+
+
+def test_an_object_before_a_dark_background_is_told_from_it(views: list[Photograph]) -> None:
+    random = torch.Generator().manual_seed(0)
+    noisy = [
+        replace(view, image=(view.image + 0.02 * torch.rand(view.image.shape, generator=random)).clamp(0, 1), mask=None)
+        for view in views
+    ]
+    found = masked(Photographs(tuple(noisy), Placement(torch.zeros(3).double(), 2.0), "ours"))
+    for view, truth in zip(found.views, views, strict=True):
+        assert view.mask is not None
+        assert truth.mask is not None
+        assert (view.mask & truth.mask).sum() / (view.mask | truth.mask).sum() > 0.9
+        there = found.placement.camera_to_world(view.camera).T_world_camera
+        assert torch.allclose(there[:3, 3], 2 * truth.camera.T_world_camera[:3, 3], atol=1e-5)
+    bright = [replace(view, image=1 - view.image) for view in noisy]
+    with pytest.raises(ValueError, match="00 and 7 others have no mask, and their background is not dark"):
+        masked(Photographs(tuple(bright), found.placement, "ours"))
+
+
+def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
+    told, apart = parted(views, 4)
+    assert [view.name for view in apart] == ["01", "05"]
+    assert len(told) == 6
+    assert parted(views, 0) == (views, [])
+    for every in (-1, 1):
+        with pytest.raises(ValueError, match=f"--held-out {every}"):
+            parted(views, every)
+
+
+def test_the_command_writes_a_mesh_in_the_folders_world(
+    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
+    save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
+    out = tmp_path / "out"
+    given = [str(tmp_path / "views"), "--out", str(out), "--steps", "30", "--sizes", "16", "32", "--rays", "128"]
+    monkeypatch.setattr(
+        "sys.argv", ["distrace", "reconstruct", *given, "--width", "16", "--resolution", "32", "--held-out", "4"]
+    )
+    main()
+    wanted = {"mesh.ply", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
+    assert wanted <= {path.name for path in out.iterdir()}
+    result = json.loads((out / "result.json").read_text())
+    assert result["rows"][0]["views_held_out"] == 2
+    assert result["rows"][0]["method"] == "ours"
+    mesh = trimesh.load(out / "mesh.ply")
+    assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)
+    assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1
+
+
+def test_photographs_without_masks_end_in_one_sentence(
+    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    bright = tuple(replace(view, image=1 - view.image, mask=None) for view in views)
+    save_photographs(tmp_path / "views", Photographs(bright, Placement(torch.zeros(3).double(), 1.0), "ours"))
+    monkeypatch.setattr("sys.argv", ["distrace", "reconstruct", str(tmp_path / "views"), "--out", str(tmp_path / "o")])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2
+    assert "give masks, white where the object is" in " ".join(capsys.readouterr().err.split())
