@@ -31,7 +31,7 @@ ORDER = [
     *("train", "resume", "prior", "starts", "fit", "fit_samples"),
     *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
     *("regions", "photo_pairs", "photo_residuals", "photo_stage", "fit_photos", "doubtful"),
-    *("surface_network", "reconstruct", "reconstruction_run"),
+    *("surface_network", "hull", "reconstruct", "reconstruction_run"),
     *(
         "bench",
         "ablation",

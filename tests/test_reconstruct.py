@@ -1,12 +1,14 @@
 """Weights fitted to photographs: of painted bumpy balls, whose shape and colours are known."""
 
 import json
+import math
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import roma
 import torch
 import trimesh
 from bumpy import bumpy_balls
@@ -15,13 +17,24 @@ from torch.nn import functional as F
 
 from distrace.boundary import shade
 from distrace.cli import main
-from distrace.cli.reconstruct import parted
+from distrace.cli.reconstruct import parted, without
 from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import value_and_gradient
+from distrace.hull import overlaps, visual_hull
+from distrace.primitives import box, sphere
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruct import MARCH, Pixels, ReconstructConfig, Reconstruction, _colour_term, coloured, reconstruct
+from distrace.reconstruct import (
+    MARCH,
+    Pixels,
+    ReconstructConfig,
+    Reconstruction,
+    _colour_term,
+    begin_with_hull,
+    coloured,
+    reconstruct,
+)
 from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
 from distrace.render import render
@@ -31,8 +44,10 @@ from distrace.trace import sphere_trace
 
 BLACK = torch.zeros(3)
 CPU = torch.device("cpu")
-SMALL = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4, colour_layers=2)
-SHORT = ReconstructConfig(steps=150, sizes=(32,), rays=256, learning_rate=2e-3)
+SMALL = SurfaceSpecs(
+    width=32, layers=2, frequencies=3, features=4, colour_width=32, colour_layers=2, colour_frequencies=3
+)
+SHORT = ReconstructConfig(steps=150, hull_steps=200, sizes=(32,), rays=256, learning_rate=5e-3)
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +113,52 @@ def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reco
     off = ((found[0] - found[1]) / (2 * step) - exact).abs()
     assert off.median() < 1e-7
     assert off.quantile(0.95) < 1e-5  # between them are kinks of the colours' network, which are ReLU's
+
+
+def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photograph]) -> None:
+    cameras = [view.camera.resized(3.0) for view in views]
+    ball = [
+        Photograph(view.name, camera, torch.ones(camera.height, camera.width, 3), render(sphere(0.5), camera).mask)
+        for view, camera in zip(views, cameras, strict=True)
+    ]
+    hull = visual_hull(ball)
+    directions = F.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    directions[:, 1] *= 0.3  # the cameras see it from the side
+    directions = F.normalize(directions, dim=-1)
+    assert hull(0.5 * directions).abs().median() < 0.03
+    assert (hull(0.3 * directions) < -0.1).all()
+    assert (hull(0.9 * directions) > 0.2).all()
+    state = Reconstruction.fresh(SMALL, SHORT, CPU)
+    begin_with_hull(state, ball, SHORT)
+    assert state.surface(0.5 * directions).abs().median() < 0.04
+
+
+def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
+    empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
+    with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
+        begin_with_hull(Reconstruction.fresh(SMALL, SHORT, CPU), empty, SHORT)
+
+
+def test_a_view_whose_camera_is_turned_is_named() -> None:
+    cameras, slab = [camera.resized(2.0) for camera in ring(16, 40)], box(torch.tensor([0.1, 0.6, 0.2]))
+    with torch.no_grad():
+        masks = [render(slab, camera).mask for camera in cameras]
+    seen = [
+        Photograph(f"{number:02}", camera, torch.ones(80, 80, 3), mask)
+        for number, (camera, mask) in enumerate(zip(cameras, masks, strict=True))
+    ]
+    assert not any(view.doubtful for view in overlaps(seen))
+    turn = torch.eye(4)
+    turn[:3, :3] = roma.rotvec_to_rotmat(torch.tensor([math.radians(15.0), 0.0, 0.0]))
+    wrong = replace(cameras[2], T_world_camera=turn @ cameras[2].T_world_camera)
+    found = overlaps([*seen[:2], replace(seen[2], camera=wrong), *seen[3:]])
+    assert [view.name for view in found if view.doubtful] == ["02"]
+
+
+def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
+    assert [view.name for view in without(views[:3], ["01"])] == ["00", "02"]
+    with pytest.raises(ValueError, match="--leave-out x y: no such view; there are 00, 01"):
+        without(views[:2], ["y", "x"])
 
 
 def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:

@@ -15,6 +15,7 @@ from torch.nn import functional as F
 
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
+from distrace.hull import visual_hull
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import attach, minimum
 from distrace.surface_network import ColourNetwork, SurfaceNetwork, SurfaceSpecs
@@ -26,6 +27,9 @@ NEAR_OUTLINE = 31  # pixels across the band from which half of the background's 
 FAR_OFF = 0.1  # rays of the background that come no closer have nothing to say
 COURSE = 100  # steps, whose mean terms are a point of a run's course
 SHELL = 0.05  # around the surface, in which half of the points lie whose gradient should have length 1
+SURVEYED = 400_000  # points, of which those near the hull's surface are kept
+STEEPEST = 1.0  # norm of the gradient by the surface's weights: a few rays that graze must not throw it off
+UNIT = 0.02  # of the hull's loss: how much the length of the gradient counts
 REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
 
 
@@ -33,15 +37,18 @@ REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
 class ReconstructConfig:
     """The schedule. Sizes are the longer sides of the images, in pixels: coarse ones, then finer ones."""
 
-    steps: int = 25_000
+    steps: int = 16_000
+    hull_steps: int = 1500  # before, of the surface alone, towards the visual hull
     sizes: tuple[int, ...] = (160, 320)
     rays: int = 1024  # of a step: half of the object, half around it
-    learning_rate: float = 5e-4
+    learning_rate: float = 1e-3  # of the colours' network …
+    surface_rate: float = 0.2  # … and × this of the surface's
     last_rate: float = 0.05  # × as much at the end; the rate falls exponentially
-    outline: float = 20.0  # the weights of the terms, to one of the colours' mean absolute difference
+    outline: float = 50.0  # the weights of the terms, to one of the colours' mean absolute difference
     eikonal: float = 1.0
-    sharpness: float = 50.0  # of an outline at first, per radius: it doubles …
+    sharpness: float = 100.0  # of an outline at first, per radius: it doubles …
     sharpenings: int = 3  # … so often, evenly over the steps
+    painting: float = 0.05  # of the steps, at first, in which colours are learnt and do not shape the surface
     colours_shape: bool = True  # without, only outlines shape the surface: a visual hull
     seed: int = 0
 
@@ -55,6 +62,10 @@ class ReconstructConfig:
 
     def sharp(self, step: int) -> float:
         return self.sharpness * 2.0 ** (step * (self.sharpenings + 1) // self.steps)
+
+    def shapes(self, step: int) -> bool:
+        """Whether colours shape the surface."""
+        return self.colours_shape and step >= self.painting * self.steps
 
     def size(self, step: int) -> int:
         return self.sizes[step * len(self.sizes) // self.steps]
@@ -120,8 +131,11 @@ class Reconstruction:
     def fresh(specs: SurfaceSpecs, config: ReconstructConfig, device: torch.device) -> "Reconstruction":
         torch.manual_seed(config.seed)
         surface, colour = SurfaceNetwork(specs).to(device), ColourNetwork(specs).to(device)
-        weights = [*surface.parameters(), *colour.parameters()]
-        return Reconstruction(surface, colour, torch.optim.Adam(weights, config.learning_rate))
+        groups = [
+            {"params": list(surface.parameters()), "share": config.surface_rate},
+            {"params": list(colour.parameters()), "share": 1.0},
+        ]
+        return Reconstruction(surface, colour, torch.optim.Adam(groups, config.learning_rate))
 
     def record(self, terms: dict[str, float], seconds: float) -> None:
         """Counts a step done."""
@@ -143,6 +157,31 @@ class Step:
     seconds: float
 
 
+def begin_with_hull(state: Reconstruction, photographs: Sequence[Photograph], config: ReconstructConfig) -> None:
+    """Teaches the surface what the masks allow: from there colours need not find what outlines know.
+
+    Raises `ValueError` for photographs without masks, or masks without anything in common.
+    """
+    began = time.perf_counter()
+    hull, device = visual_hull(photographs), state.surface.last.weight.device
+    random = torch.Generator().manual_seed(config.seed)
+    points = 2 * torch.rand(SURVEYED, 3, generator=random) - 1
+    near = points[hull(points).abs() < SHELL]
+    optimiser = torch.optim.Adam(state.surface.parameters())
+    for step in range(config.hull_steps):
+        optimiser.param_groups[0]["lr"] = config.learning_rate * (1 - step / config.hull_steps)
+        some = near[torch.randint(len(near), (config.rays,), generator=random)]
+        about = some + SHELL / 2 * torch.randn(some.shape, generator=random)
+        anywhere = 2 * torch.rand(config.rays, 3, generator=random) - 1
+        asked = torch.cat([about, anywhere])
+        value, gradient = value_and_gradient(state.surface, asked.to(device))
+        loss = (value - hull(asked).to(device)).abs().mean() + UNIT * _unit(gradient)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    state.seconds += time.perf_counter() - began
+
+
 def reconstruct(
     photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig = ReconstructConfig()
 ) -> Iterator[Step]:
@@ -160,13 +199,14 @@ def reconstruct(
             if not len(pixels.groups[0]):
                 raise ValueError("the masks of the photographs mark no pixel in the unit sphere as object")
         for group in state.optimiser.param_groups:
-            group["lr"] = config.rate(state.step)
+            group["lr"] = group["share"] * config.rate(state.step)
         random = torch.Generator().manual_seed((config.seed << 32) + state.step)
         some = pixels.drawn(config.rays, random).to(device)
         terms = _terms(some, state, config, random)
         weighted = terms["colour"] + config.outline * terms["outline"] + config.eikonal * terms["eikonal"]
         state.optimiser.zero_grad()
         weighted.backward()
+        torch.nn.utils.clip_grad_norm_(state.surface.parameters(), STEEPEST)
         state.optimiser.step()
         told = {name: value.item() for name, value in terms.items()}
         state.record(told, seconds := time.perf_counter() - began)
@@ -181,7 +221,7 @@ def _terms(
     trace = sphere_trace(state.surface, pixels.rays, bounds, MARCH)
     state.evaluations += trace.total_evaluations + 3 * len(pixels.rays.origins)
     seen = trace.hit & pixels.is_object
-    colour = _colour_term(pixels, trace, seen, state, config.colours_shape)
+    colour = _colour_term(pixels, trace, seen, state, config.shapes(state.step))
     outline = _outline_term(pixels, bounds, trace, ~seen, state.surface, config.sharp(state.step))
     points = pixels.rays[trace.hit].at(trace.distance[trace.hit])
     return {"colour": colour, "outline": outline, "eikonal": _eikonal_term(points, state.surface, random)}
@@ -244,4 +284,8 @@ def _eikonal_term(hits: Float[Tensor, "n 3"], surface: SurfaceNetwork, random: t
     anywhere = 2 * torch.rand(count, 3, generator=random) - 1
     about = hits + (SHELL * torch.randn(hits.shape, generator=random)).to(hits)
     _, gradient = value_and_gradient(surface, torch.cat([anywhere.to(hits), about]))
+    return _unit(gradient)
+
+
+def _unit(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     return (gradient.norm(dim=-1) - 1).square().mean()

@@ -22,9 +22,11 @@ class SurfaceSpecs:
 
     width: int = 128
     layers: int = 4
-    frequencies: int = 6  # of the positional encoding of points: 2⁰ … 2⁵ · π, fewer than a picture has pixels
+    frequencies: int = 6  # of the positional encoding of points: 2⁰ … 2⁵ · π
     features: int = 32  # that the surface's network hands to the colours'
+    colour_width: int = 256
     colour_layers: int = 3
+    colour_frequencies: int = 9  # as fine as pixels: it is asked at few points, and may be larger
     view_frequencies: int = 2  # of the encoding of directions: what shines is smooth
     radius: float = 0.5  # of the ball that a surface begins as
 
@@ -79,11 +81,11 @@ class ColourNetwork(nn.Module):
     def __init__(self, specs: SurfaceSpecs = SurfaceSpecs()) -> None:
         super().__init__()
         self.specs = specs
-        entered = 3 + 6 * specs.frequencies + 3 + 3 + 6 * specs.view_frequencies + specs.features
-        widths = [entered, *[specs.width] * specs.colour_layers]
+        entered = 3 + 6 * specs.colour_frequencies + 3 + 3 + 6 * specs.view_frequencies + specs.features
+        widths = [entered, *[specs.colour_width] * specs.colour_layers]
         layers = [nn.Linear(before, after) for before, after in pairwise(widths)]
         self.layers = nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())))
-        self.last = nn.Linear(specs.width, 3)
+        self.last = nn.Linear(specs.colour_width, 3)
 
     def forward(
         self,
@@ -94,7 +96,7 @@ class ColourNetwork(nn.Module):
     ) -> Float[Tensor, "*batch 3"]:
         """Directions are those of rays, from the eye to the point."""
         seen = encoded(directions, self.specs.view_frequencies)
-        entered = torch.cat([encoded(points, self.specs.frequencies), normals, seen, features], dim=-1)
+        entered = torch.cat([encoded(points, self.specs.colour_frequencies), normals, seen, features], dim=-1)
         return self.last(self.layers(entered)).sigmoid()
 
 

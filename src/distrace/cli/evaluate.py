@@ -13,6 +13,7 @@ from distrace.cli.common import Meshes, ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
 from distrace.cli.evaluate_data import Card, Choices, Splits
 from distrace.cli.evaluate_depth import Focal, Multiview, Noise, SparseDepth, Spread
+from distrace.cli.evaluate_photographs import Photographs
 from distrace.data.split import on_side
 from distrace.evaluate import (
     Result,
@@ -116,6 +117,7 @@ Table = (
     | Annotated[Focal, tyro.conf.subcommand("focal")]
     | Annotated[Spread, tyro.conf.subcommand("spread")]
     | Annotated[Multiview, tyro.conf.subcommand("multiview")]
+    | Annotated[Photographs, tyro.conf.subcommand("photographs")]
     | Annotated[Pose, tyro.conf.subcommand("pose")]
     | Annotated[Splits, tyro.conf.subcommand("splits")]
     | Annotated[Choices, tyro.conf.subcommand("choices")]

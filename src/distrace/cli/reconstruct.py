@@ -17,9 +17,10 @@ from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, load_photographs, notes
 from distrace.files import save_json, save_text
+from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
 from distrace.movie import save_gif
-from distrace.reconstruct import COURSE, ReconstructConfig, Reconstruction, reconstruct
+from distrace.reconstruct import COURSE, ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
 from distrace.shading import grid, save_png
@@ -43,9 +44,10 @@ class Reconstruct:
     steps: int = ReconstructConfig.steps
     sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
     rays: int = ReconstructConfig.rays  # of each step
-    width: int = SurfaceSpecs.width  # of both networks
+    width: int = SurfaceSpecs.width  # of the surface's network
     silhouettes_only: Flag = False  # colours do not shape the surface: a visual hull, painted
     held_out: int = 8  # one view in so many is not fitted to, but compared; 0 for none
+    leave_out: tuple[str, ...] = ()  # names of views that are not used at all
     resolution: int = 256  # of the mesh
     seed: int = 0
     save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
@@ -57,6 +59,10 @@ class Reconstruct:
         found = masked(load_photographs(self.views))
         for note in notes(found):
             console.print(note, markup=False)
+        found = replace(found, views=without(found.views, self.leave_out))
+        for each in overlaps(found.views):
+            if each.doubtful:
+                console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
         state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
         made = Made(self.views.name, state, self.config, found, told, kept_back)
@@ -70,6 +76,15 @@ class Reconstruct:
     @property
     def specs(self) -> SurfaceSpecs:
         return SurfaceSpecs(width=self.width)
+
+
+def without(views: Sequence[Photograph], names: Sequence[str]) -> tuple[Photograph, ...]:
+    """The views of other names. Raises `ValueError` for a name that no view has."""
+    unknown = set(names) - {view.name for view in views}
+    if unknown:
+        known = ", ".join(view.name for view in views)
+        raise ValueError(f"--leave-out {' '.join(sorted(unknown))}: no such view; there are {known}")
+    return tuple(view for view in views if view.name not in names)
 
 
 def parted(views: Sequence[Photograph], every: int) -> tuple[list[Photograph], list[Photograph]]:
@@ -98,6 +113,9 @@ def fitted(
     state = load_reconstruction(run.out, config, specs, names, run.device)
     if state.step:
         console.print(f"going on from step {state.step} of {config.steps}")
+    else:
+        console.print("carving what the masks allow, and teaching the network that")
+        begin_with_hull(state, views, config)
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     saved, due = time.perf_counter(), -(-config.steps // PREVIEWS)
     with progress("reconstructing", config.steps) as bar:
@@ -111,6 +129,13 @@ def fitted(
                 saved = time.perf_counter()
     save_reconstruction(run.out, state, config, names)
     return state
+
+
+def _doubt(view: Overlap) -> str:
+    agreed = f"its outline and that of all others have {view.iou:.0%} in common"
+    return (
+        f"{view.name} does not agree with the others: {agreed}; is its camera right? --leave-out {view.name} drops it"
+    )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,116 @@
+"""What masks allow: a visual hull on a grid, as a field of distances that a network can begin with.
+
+Laurentini, *The visual hull concept for silhouette-based image understanding*, PAMI 1994.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import median
+
+import torch
+from jaxtyping import Bool, Float
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+from torch.nn import functional as F
+
+from distrace.camera import Camera
+from distrace.data.photograph import Photograph
+from distrace.field import SDF
+from distrace.rays import meet_sphere
+from distrace.trace import TraceConfig, sphere_trace
+
+CELLS = 160  # along each axis of the cube around the unit sphere
+SEEN = 0.25  # of the views, and two at least, must have seen a place
+WRONG = 0.05  # of the masks that see a place may leave it out …
+ONE_WRONG = 0.1  # … and so many, one at least, where it is to be found out which are wrong
+COARSE = 96  # pixels along the longer side, of views that are compared
+FAR_OFF = 2.5  # × the median over views: a view whose outline is off by more is doubtful …
+NOTICEABLE = 0.15  # … if so much of it is, too
+MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=2e-3, steps=60, least_step=4e-3)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Intersection over union of a view's mask and the hull of all, as its camera sees it."""
+
+    name: str
+    iou: float
+    doubtful: bool
+
+
+@torch.no_grad()
+def overlaps(photographs: Sequence[Photograph]) -> list[Overlap]:
+    """How well each photograph's outline agrees with the others': one that does not most often has a wrong camera.
+
+    Raises `ValueError` for masks without anything in common.
+    """
+    hull, found = _hull_of(photographs, ONE_WRONG, least=1.0), []
+    for each in photographs:
+        coarse = each.resized(min(1.0, COARSE / max(each.camera.height, each.camera.width)))
+        assert coarse.mask is not None
+        rays = coarse.camera.rays()
+        hit = sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit
+        found.append(float((hit & coarse.mask).sum() / (hit | coarse.mask).sum().clamp_min(1)))
+    limit = max(NOTICEABLE, FAR_OFF * median(1 - iou for iou in found))
+    return [Overlap(each.name, iou, 1 - iou > limit) for each, iou in zip(photographs, found, strict=True)]
+
+
+def visual_hull(photographs: Sequence[Photograph]) -> SDF:
+    """The distance from the surface of what nearly all masks allow in the unit sphere, to about a cell.
+
+    Raises `ValueError` for photographs without masks, or masks without anything in common.
+    """
+    return _hull_of(photographs, WRONG)
+
+
+@torch.no_grad()
+def _hull_of(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> SDF:
+    """A share of the masks that see a place, and `least` of them, may leave it out."""
+    without = [each.name for each in photographs if each.mask is None]
+    if without:
+        raise ValueError(f"{', '.join(without)}: no mask; a hull is carved by what masks say is not object")
+    steps = (torch.arange(CELLS) + 0.5) * 2 / CELLS - 1
+    places = torch.cartesian_prod(steps, steps, steps)
+    seen, left_out = torch.zeros(len(places)), torch.zeros(len(places))
+    for each in photographs:
+        assert each.mask is not None
+        inside, on_object = _looked_up(each.camera, each.mask, places)
+        seen += inside
+        left_out += inside & ~on_object
+    solid = (
+        (seen >= max(2.0, SEEN * len(photographs)))
+        & (left_out <= (wrong * seen).clamp_min(least))
+        & (places.norm(dim=-1) < 1)
+    )
+    if not solid.any():
+        raise ValueError(
+            f"nothing lies within the masks of {len(photographs)} views together; are they inverted, or the cameras"
+            " others?"
+        )
+    return _distances(solid.reshape(CELLS, CELLS, CELLS))
+
+
+def _looked_up(
+    camera: Camera, mask: Bool[Tensor, "h w"], places: Float[Tensor, "n 3"]
+) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
+    """Which places are in the image, and which of these on its object."""
+    pixels, depths = camera.project(places)
+    column, row = pixels.floor().long().unbind(-1)
+    inside = (depths > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    allowed = inside.clone()
+    allowed[inside] = mask[row[inside], column[inside]]
+    return inside, allowed
+
+
+def _distances(solid: Bool[Tensor, "n n n"]) -> SDF:
+    """Between the middles of the cells linearly."""
+    cells = solid.shape[0]
+    outside, within = (torch.from_numpy(distance_transform_edt(part.numpy())).float() for part in (~solid, solid))
+    grid = ((outside - within) * 2 / cells)[None, None]
+
+    def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        at = points.reshape(1, 1, 1, -1, 3).flip(-1).cpu()  # grid_sample's x is the last axis
+        found = F.grid_sample(grid, at, padding_mode="border", align_corners=False)
+        return found.reshape(points.shape[:-1]).to(points)
+
+    return field
