@@ -39,7 +39,7 @@ from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
 from distrace.render import render
 from distrace.surface import attach
-from distrace.surface_network import SurfaceNetwork, SurfaceSpecs, squareplus
+from distrace.surface_network import ColourNetwork, SurfaceNetwork, SurfaceSpecs, squareplus
 from distrace.trace import sphere_trace
 
 BLACK = torch.zeros(3)
@@ -74,6 +74,19 @@ def test_a_surface_begins_as_a_ball() -> None:
     value, gradient = value_and_gradient(surface, 0.5 * directions)
     assert value.abs().max() < 0.3
     assert (gradient * directions).sum(-1).mean() > 0.8
+
+
+def test_light_depends_on_normal_and_direction_alone() -> None:
+    torch.manual_seed(0)
+    colour, points, features = ColourNetwork(SMALL), torch.randn(2, 3), torch.randn(2, SMALL.features)
+    normals, directions = F.normalize(torch.randn(2, 2, 3), dim=-1)
+
+    def seen(n: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+        return colour(points, n.expand(2, 3), v.expand(2, 3), features).logit()
+
+    one, other = seen(normals[0], directions[0]), seen(normals[1], directions[1])
+    assert not torch.allclose(one, other)
+    assert torch.allclose(one[0] - one[1], other[0] - other[1], atol=1e-5)
 
 
 def test_squareplus_is_smooth_and_close_to_relu() -> None:

@@ -42,7 +42,7 @@ class ReconstructConfig:
     sizes: tuple[int, ...] = (160, 320)
     rays: int = 1024  # of a step: half of the object, half around it
     learning_rate: float = 1e-3  # of the colours' network …
-    surface_rate: float = 0.2  # … and × this of the surface's
+    surface_rate: float = 0.5  # … and × this of the surface's
     last_rate: float = 0.05  # × as much at the end; the rate falls exponentially
     outline: float = 50.0  # the weights of the terms, to one of the colours' mean absolute difference
     eikonal: float = 1.0

@@ -1,7 +1,7 @@
 """Networks of one object and nothing else: its surface, and its colours in the light it was photographed in.
 
-Surface and colour as in IDR (Yariv et al., NeurIPS 2020); the surface's network begins as a ball (Atzmon and Lipman,
-*SAL*, CVPR 2020, section 4).
+After IDR (Yariv et al., NeurIPS 2020), but with the light apart from what a point has of its own. The surface's network
+begins as a ball (Atzmon and Lipman, *SAL*, CVPR 2020, section 4).
 """
 
 import math
@@ -27,7 +27,8 @@ class SurfaceSpecs:
     colour_width: int = 256
     colour_layers: int = 3
     colour_frequencies: int = 9  # as fine as pixels: it is asked at few points, and may be larger
-    view_frequencies: int = 2  # of the encoding of directions: what shines is smooth
+    light_width: int = 32
+    view_frequencies: int = 1  # of the encoding of directions: what shines is smooth
     radius: float = 0.5  # of the ball that a surface begins as
 
     def __post_init__(self) -> None:
@@ -76,16 +77,18 @@ class SurfaceNetwork(nn.Module):
 
 
 class ColourNetwork(nn.Module):
-    """Colours from 0 to 1 of a surface's points, by normal, direction of view and the surface's own features."""
+    """Colours from 0 to 1: what a point has of its own, in a light that depends on normal and direction alone.
+
+    With both in one network, as in IDR, few photographs are learnt by heart: each gets a texture of its own, and no
+    shape is told by how textures shift from one to the next.
+    """
 
     def __init__(self, specs: SurfaceSpecs = SurfaceSpecs()) -> None:
         super().__init__()
         self.specs = specs
-        entered = 3 + 6 * specs.colour_frequencies + 3 + 3 + 6 * specs.view_frequencies + specs.features
-        widths = [entered, *[specs.colour_width] * specs.colour_layers]
-        layers = [nn.Linear(before, after) for before, after in pairwise(widths)]
-        self.layers = nn.Sequential(*(part for layer in layers for part in (layer, nn.ReLU())))
-        self.last = nn.Linear(specs.colour_width, 3)
+        own = 3 + 6 * specs.colour_frequencies + specs.features
+        self.own = _layers([own, *[specs.colour_width] * specs.colour_layers, 3])
+        self.light = _layers([6 + 6 * specs.view_frequencies, specs.light_width, specs.light_width, 3])
 
     def forward(
         self,
@@ -95,9 +98,14 @@ class ColourNetwork(nn.Module):
         features: Float[Tensor, "*batch n"],
     ) -> Float[Tensor, "*batch 3"]:
         """Directions are those of rays, from the eye to the point."""
-        seen = encoded(directions, self.specs.view_frequencies)
-        entered = torch.cat([encoded(points, self.specs.colour_frequencies), normals, seen, features], dim=-1)
-        return self.last(self.layers(entered)).sigmoid()
+        own = self.own(torch.cat([encoded(points, self.specs.colour_frequencies), features], dim=-1))
+        light = self.light(torch.cat([normals, encoded(directions, self.specs.view_frequencies)], dim=-1))
+        return (own + light).sigmoid()
+
+
+def _layers(widths: list[int]) -> nn.Sequential:
+    parts = [part for before, after in pairwise(widths) for part in (nn.Linear(before, after), nn.ReLU())]
+    return nn.Sequential(*parts[:-1])
 
 
 def squareplus(x: Float[Tensor, "*batch n"]) -> Float[Tensor, "*batch n"]:
