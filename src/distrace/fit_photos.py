@@ -20,7 +20,9 @@ from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.starts import Starts, Step, best_of
 
-SCREENED = 1000  # rays on which the training shapes are compared
+SCREENED = 400  # rays on which all training shapes are compared, …
+COMPARED = 1000  # … and those on which the best of them are: one in so many, and no fewer than
+KEPT, FEWEST = 8, 8
 
 
 @dataclass(frozen=True)
@@ -78,21 +80,27 @@ def fit_photos(
 def ranked(
     decoder: Decoder, stage: Stage, prior: Prior, config: Comparing, place: Similarity, seed: int = 0
 ) -> list[tuple[float, torch.Tensor]]:
-    """The training shapes' losses and coordinates, the least loss first."""
-    found = []
-    for w in map(prior.coordinates, prior.codes):
-        random = torch.Generator().manual_seed(seed)
-        problem, look = stage.problem(decoder, prior, Shape(w, place), config, random)
-        terms = problem.terms(look, problem.residuals(look))
-        found.append((terms["colour"] + terms["outline"], w))
-    return sorted(found, key=lambda pair: pair[0])
+    """The losses and coordinates of the best training shapes, the least loss first; of all of them, on fewer rays."""
+    codes = [prior.coordinates(code) for code in prior.codes]
+    for rays in (min(SCREENED, config.rays), config.rays):
+        losses = [_loss(decoder, stage, prior, replace(config, rays=rays), Shape(w, place), seed) for w in codes]
+        order = sorted(range(len(codes)), key=lambda number: losses[number])
+        codes = [codes[number] for number in order[: max(len(prior.codes) // KEPT, FEWEST)]]
+    return [(losses[number], w) for number, w in zip(order, codes)]
+
+
+def _loss(decoder: Decoder, stage: Stage, prior: Prior, config: Comparing, shape: Shape, seed: int) -> float:
+    """Of colours and outlines, on rays that are the same for all shapes."""
+    problem, look = stage.problem(decoder, prior, shape, config, torch.Generator().manual_seed(seed))
+    terms = problem.terms(look, problem.residuals(look))
+    return terms["colour"] + terms["outline"]
 
 
 def _starts(decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, place: Similarity) -> list[torch.Tensor]:
     """The mean's coordinates, those of training shapes, and a draw."""
     if config.starts == 1:
         return [prior.start(0, config.seed)]
-    few = replace(config.compared, rays=SCREENED)
+    few = replace(config.compared, rays=COMPARED)
     nearest = [w for _, w in ranked(decoder, stage, prior, few, place, config.seed)[: config.starts - 2]]
     draws = [prior.start(k, config.seed) for k in range(1, config.starts - len(nearest))]
     return [prior.start(0, config.seed), *nearest, *draws]
