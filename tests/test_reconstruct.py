@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Callable, Iterator
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -48,6 +49,21 @@ SMALL = SurfaceSpecs(
     width=32, layers=2, frequencies=3, features=4, colour_width=32, colour_layers=2, colour_frequencies=3
 )
 SHORT = ReconstructConfig(steps=150, hull_steps=200, sizes=(32,), rays=256, learning_rate=5e-3)
+
+
+Command = Callable[..., None]
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
+    """The command line, in this process; whatever it sets for the process is set back."""
+
+    def command(*arguments: object) -> None:
+        monkeypatch.setattr("sys.argv", ["distrace", "reconstruct", *map(str, arguments)])
+        main()
+
+    yield command
+    torch.set_flush_denormal(False)
 
 
 @pytest.fixture(scope="module")
@@ -233,17 +249,12 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
             parted(views, every)
 
 
-def test_the_command_writes_a_mesh_in_the_folders_world(
-    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_writes_a_mesh_in_the_folders_world(views: list[Photograph], tmp_path: Path, run: Command) -> None:
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
     out = tmp_path / "out"
-    given = [str(tmp_path / "views"), "--out", str(out), "--steps", "30", "--sizes", "16", "32", "--rays", "128"]
-    monkeypatch.setattr(
-        "sys.argv", ["distrace", "reconstruct", *given, "--width", "16", "--resolution", "32", "--held-out", "4"]
-    )
-    main()
+    few = ["--steps", 30, "--sizes", 16, 32, "--rays", 128, "--width", 16, "--resolution", 32, "--held-out", 4]
+    run(tmp_path / "views", "--out", out, *few)
     wanted = {"mesh.ply", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
     assert wanted <= {path.name for path in out.iterdir()}
     result = json.loads((out / "result.json").read_text())
@@ -255,12 +266,11 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
 
 
 def test_photographs_without_masks_end_in_one_sentence(
-    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+    views: list[Photograph], tmp_path: Path, run: Command, capsys: pytest.CaptureFixture
 ) -> None:
     bright = tuple(replace(view, image=1 - view.image, mask=None) for view in views)
     save_photographs(tmp_path / "views", Photographs(bright, Placement(torch.zeros(3).double(), 1.0), "ours"))
-    monkeypatch.setattr("sys.argv", ["distrace", "reconstruct", str(tmp_path / "views"), "--out", str(tmp_path / "o")])
     with pytest.raises(SystemExit) as stop:
-        main()
+        run(tmp_path / "views", "--out", tmp_path / "o")
     assert stop.value.code == 2
     assert "give masks, white where the object is" in " ".join(capsys.readouterr().err.split())
