@@ -28,10 +28,10 @@ ORDER = [
     ),
     *("differences", "moves", "retrace", "gradcheck", "dist_gradient"),
     *("losses", "warp", "metrics", "mesh", "data", "targets", "sight"),
-    *("train", "resume", "prior", "starts", "fit", "fit_samples"),
+    *("course", "train", "resume", "prior", "starts", "fit", "fit_samples"),
     *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
     *("regions", "photo_pairs", "photo_residuals", "photo_stage", "fit_photos", "doubtful"),
-    *("surface_network", "hull", "reconstruct", "reconstruction_run"),
+    *("surface_network", "hull", "reconstruction_terms", "reconstruct", "reconstruction_run"),
     *(
         "bench",
         "ablation",

@@ -26,18 +26,10 @@ from distrace.field import value_and_gradient
 from distrace.hull import overlaps, visual_hull
 from distrace.primitives import box, sphere
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruct import (
-    MARCH,
-    Pixels,
-    ReconstructConfig,
-    Reconstruction,
-    _colour_term,
-    begin_with_hull,
-    coloured,
-    reconstruct,
-)
+from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.reconstruction_terms import MARCH, Pool, colour_term, coloured
 from distrace.render import render
 from distrace.surface import attach
 from distrace.surface_network import ColourNetwork, SurfaceNetwork, SurfaceSpecs, squareplus
@@ -118,14 +110,14 @@ def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted
     assert after.silhouette_iou > max(0.9, before.silhouette_iou)
     assert after.psnr > before.psnr + 3
     assert fitted.evaluations > SHORT.steps * SHORT.rays
-    assert len(fitted.course) == 2
-    assert fitted.course[-1]["colour"] < fitted.course[0]["colour"]
+    first, last = fitted.course["colour"]
+    assert last < first
 
 
 def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reconstruction) -> None:
     """The derivatives of colours by the surface's last bias agree with those of rays traced anew."""
     surface, colour = deepcopy(fitted.surface).double(), deepcopy(fitted.colour).double()
-    rays, bias = Pixels.of(views[1:3], 40).rays, surface.last.bias
+    rays, bias = Pool.of(views[1:3], 40).pixels.rays, surface.last.bias
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
     march = replace(MARCH, tolerance=1e-10, steps=400, step_scale=0.8)
     trace = sphere_trace(surface, rays, meet_sphere(rays), march)
@@ -193,9 +185,9 @@ def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
 def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
     config = replace(SHORT, colours_shape=False)
     state = Reconstruction.fresh(SMALL, config, CPU)
-    pixels = Pixels.of(views, 32)
+    pixels = Pool.of(views, 32).pixels
     trace = sphere_trace(state.surface, pixels.rays, meet_sphere(pixels.rays), MARCH)
-    _colour_term(pixels, trace, trace.hit & pixels.is_object, state, False).backward()
+    colour_term(pixels, trace, trace.hit & pixels.is_object, state.surface, state.colour, False).backward()
     assert all(weight.grad is None for weight in state.surface.parameters())
     assert any(weight.grad is not None for weight in state.colour.parameters())
 

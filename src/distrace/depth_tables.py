@@ -14,6 +14,7 @@ from distrace.render import render
 from distrace.report import View
 from distrace.shading import Picture, grid
 from distrace.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, true_solid
+from distrace.trials import grouped
 
 PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than ours (Liu et al., CVPR 2020, table 3)
     ("sofa", "DeepSDF"): (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
@@ -33,9 +34,7 @@ LABELS = {"density": "depths", "noise": "noise on the depths", "focal_ratio": "f
 
 def rows_of(results: Sequence[Done], axis: str) -> list[dict[str, object]]:
     """One row for each class, method and step of the axis, in the order in which they were tried."""
-    groups: dict[tuple, list[Done]] = {}
-    for each in results:
-        groups.setdefault((each.trial.category, each.trial.method, getattr(each.trial, axis)), []).append(each)
+    groups = grouped(results, lambda each: (each.trial.category, each.trial.method, getattr(each.trial, axis)))
     return [
         {
             "class": category,

@@ -10,6 +10,7 @@ from distrace.data.view import observe
 from distrace.metrics import depth_errors, iou
 from distrace.render import render
 from distrace.sparse_depth import RATIOS, Place, Trial, camera_of, done, true_solid
+from distrace.trials import grouped
 
 COARSER = 0.5  # × the resolution of the observations
 
@@ -41,9 +42,7 @@ def looks(place: Place, trial: Trial) -> list[Look]:
 
 def look_rows(found: Sequence[Look]) -> list[dict[str, object]]:
     """Medians of each class, method and focal length."""
-    groups: dict[tuple, list[Look]] = {}
-    for each in found:
-        groups.setdefault((each.category, each.method, each.focal_ratio), []).append(each)
+    groups = grouped(found, lambda each: (each.category, each.method, each.focal_ratio))
     return [
         {
             "class": category,

@@ -13,9 +13,10 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 
-from distrace.camera import Camera
+from distrace.data.carving import looked_up
 from distrace.data.photograph import Photograph
 from distrace.field import SDF
+from distrace.metrics import iou
 from distrace.rays import meet_sphere
 from distrace.trace import TraceConfig, sphere_trace
 
@@ -42,15 +43,13 @@ class Overlap:
 def overlaps(photographs: Sequence[Photograph]) -> list[Overlap]:
     """How well each photograph's outline agrees with the others': one that does not most often has a wrong camera.
 
-    Raises `ValueError` for masks without anything in common.
+    Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
     hull, found = _hull_of(photographs, ONE_WRONG, least=1.0), []
     for each in photographs:
-        coarse = each.resized(min(1.0, COARSE / max(each.camera.height, each.camera.width)))
-        assert coarse.mask is not None
+        coarse = each.at_most(COARSE)
         rays = coarse.camera.rays()
-        hit = sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit
-        found.append(float((hit & coarse.mask).sum() / (hit | coarse.mask).sum().clamp_min(1)))
+        found.append(iou(sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit, coarse.known_mask))
     limit = max(NOTICEABLE, FAR_OFF * median(1 - iou for iou in found))
     return [Overlap(each.name, iou, 1 - iou > limit) for each, iou in zip(photographs, found, strict=True)]
 
@@ -66,15 +65,11 @@ def visual_hull(photographs: Sequence[Photograph]) -> SDF:
 @torch.no_grad()
 def _hull_of(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> SDF:
     """A share of the masks that see a place, and `least` of them, may leave it out."""
-    without = [each.name for each in photographs if each.mask is None]
-    if without:
-        raise ValueError(f"{', '.join(without)}: no mask; a hull is carved by what masks say is not object")
     steps = (torch.arange(CELLS) + 0.5) * 2 / CELLS - 1
     places = torch.cartesian_prod(steps, steps, steps)
     seen, left_out = torch.zeros(len(places)), torch.zeros(len(places))
     for each in photographs:
-        assert each.mask is not None
-        inside, on_object = _looked_up(each.camera, each.mask, places)
+        inside, on_object = looked_up(each.camera, each.known_mask, places)
         seen += inside
         left_out += inside & ~on_object
     solid = (
@@ -88,18 +83,6 @@ def _hull_of(photographs: Sequence[Photograph], wrong: float, least: float = 0.0
             " others?"
         )
     return _distances(solid.reshape(CELLS, CELLS, CELLS))
-
-
-def _looked_up(
-    camera: Camera, mask: Bool[Tensor, "h w"], places: Float[Tensor, "n 3"]
-) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
-    """Which places are in the image, and which of these on its object."""
-    pixels, depths = camera.project(places)
-    column, row = pixels.floor().long().unbind(-1)
-    inside = (depths > 0) & (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
-    allowed = inside.clone()
-    allowed[inside] = mask[row[inside], column[inside]]
-    return inside, allowed
 
 
 def _distances(solid: Bool[Tensor, "n n n"]) -> SDF:

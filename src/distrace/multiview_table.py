@@ -31,7 +31,7 @@ from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.sparse_depth import fingerprint, hash_of, true_solid
-from distrace.trials import opened_once, read_json
+from distrace.trials import grouped, opened_once, read_json
 
 METHODS = ("nearest", "silhouettes", "ours", "ours, moved")
 KNOWN_PLACE = PhotoConfig(compared=Comparing(moves=False))
@@ -161,9 +161,7 @@ def _silhouette(folder: Path, view: Photograph) -> View:
 
 def multiview_rows(results: Sequence[ClipResult]) -> list[dict[str, object]]:
     """Medians of each class, background and method."""
-    groups: dict[tuple, list[ClipResult]] = {}
-    for each in results:
-        groups.setdefault((each.category, each.background, each.method), []).append(each)
+    groups = grouped(results, lambda each: (each.category, each.background, each.method))
     return [
         {
             "class": category,

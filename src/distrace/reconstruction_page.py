@@ -11,11 +11,14 @@ import trimesh
 from torch.nn import functional as F
 
 from distrace.charts import curves
+from distrace.course import COURSE
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import iou
 from distrace.page import Html, figure, page, paragraph, section, table
-from distrace.reconstruct import Reconstruction, coloured
+from distrace.reconstruct import Reconstruction
+from distrace.reconstruction_terms import coloured
 from distrace.render import Buffers, render
 from distrace.scene import scene
 from distrace.shading import Picture, mask_comparison, normal_picture, side_by_side
@@ -37,23 +40,17 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
 
     Raises `ValueError` for a photograph without a mask.
     """
-    if photograph.mask is None:
-        raise ValueError(f"{photograph.name} has no mask; without one nothing says where to compare it")
-    view = photograph.resized(min(1.0, size / max(photograph.mask.shape)))
-    assert view.mask is not None
+    view = photograph.at_most(size)
     buffers, made = seen(state, view)
-    hit, mask, image = buffers.mask.cpu(), view.mask, view.image
+    hit, mask, image = buffers.mask.cpu(), view.known_mask, view.image
     error = (made - image)[mask].square().mean().clamp_min(1e-10)
-    union = (hit | mask).sum().clamp_min(1)
     pictures = [
         _picture(torch.where(mask[..., None], image, 0.4 * image)),
         _picture(torch.where(hit[..., None], made, 1.0)),
         normal_picture(buffers.normal, buffers.mask, view.camera.T_world_camera),
         mask_comparison(mask, hit),
     ]
-    return Judged(
-        photograph.name, -10 * math.log10(float(error)), float((hit & mask).sum() / union), side_by_side(pictures)
-    )
+    return Judged(photograph.name, -10 * math.log10(float(error)), iou(mask, hit), side_by_side(pictures))
 
 
 @torch.no_grad()
@@ -94,14 +91,12 @@ def reconstruction_page(
     name: str,
     held_out: Sequence[Judged],
     told: Sequence[Judged],
-    course: Sequence[Mapping[str, float]],
-    every: int,
+    course: Mapping[str, Sequence[float]],
     mesh: trimesh.Trimesh,
     facts: Mapping[str, str],
 ) -> str:
     """Views that were held out, some that were not, the mesh, and the course of the loss."""
     about = "The photograph, what is not object dimmed; the rendering; its normals; masks, orange missing, blue extra."
-    terms = {term: [float(each[term]) for each in course] for term in (course[0] if course else {})}
     return page(
         f"{name} from photographs",
         "A surface and its colours, as the weights of two networks: sphere-traced, with exact gradients.",
@@ -109,7 +104,7 @@ def reconstruction_page(
             *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
             section("Views it was fitted to", *map(_shown, told)),
             section("In space", scene({"Surface": mesh}, {})),
-            section("Course", curves(terms, f"× {every} steps", "mean of a term", True)),
+            section("Course", curves(course, f"× {COURSE} steps", "mean of a term", True)),
             section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
         ],
     )

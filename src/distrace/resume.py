@@ -6,10 +6,11 @@ from pathlib import Path
 
 import torch
 
+from distrace.course import COURSE
 from distrace.decoder import NetworkSpecs
 from distrace.errors import explained
 from distrace.files import written
-from distrace.train import COURSE, TrainConfig, Training, start
+from distrace.train import TrainConfig, Training, start
 
 NAME = "checkpoint.pt"
 

@@ -13,6 +13,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from distrace.field import Counted
+
 BEND = 2e-4  # of the activation: nearly a ReLU, but with second derivatives
 
 
@@ -74,6 +76,21 @@ class SurfaceNetwork(nn.Module):
                 layer.weight[:, 3:] = 0.0
         self.last.weight[:1].normal_(math.sqrt(math.pi / self.specs.width), 1e-4)
         self.last.bias[:1] = -self.specs.radius
+
+
+class CountedSurface(Counted):
+    """The same surface, counting the points that it was asked for, with or without features."""
+
+    def __init__(self, surface: SurfaceNetwork) -> None:
+        super().__init__(surface)
+        self.surface = surface
+
+    def features(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n"]]:
+        self.evaluations += points.numel() // 3
+        return self.surface.features(points)
+
+
+Surface = SurfaceNetwork | CountedSurface
 
 
 class ColourNetwork(nn.Module):

@@ -12,11 +12,11 @@ from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from distrace.checkpoint import Model
+from distrace.course import record
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 
 VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
-COURSE = 100  # steps, whose mean loss is a point of a run's course
 
 
 @dataclass(frozen=True)
@@ -78,10 +78,7 @@ class Training:
 
     def record(self, loss: float) -> None:
         """Counts a step done."""
-        done = self.step % COURSE
-        if not done:
-            self.losses.append(0.0)
-        self.losses[-1] += (loss - self.losses[-1]) / (done + 1)
+        record(self.losses, self.step, loss)
         self.step += 1
 
 

@@ -1,7 +1,7 @@
 """Experiments of many trials that do not depend on each other: in processes, going on where they were stopped."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from functools import cache
 from multiprocessing import get_context
@@ -28,6 +28,14 @@ def each_done(work: Callable[[Trial], Result], wanted: Sequence[Trial], jobs: in
                 yield done.result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def grouped(results: Iterable[Result], key: Callable[[Result], tuple]) -> dict[tuple, list[Result]]:
+    """Results of one key together, in the order in which the keys first come."""
+    groups: dict[tuple, list[Result]] = {}
+    for each in results:
+        groups.setdefault(key(each), []).append(each)
+    return groups
 
 
 @cache

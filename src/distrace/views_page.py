@@ -64,7 +64,7 @@ def forming(model: Model, steps: Sequence[PhotoStep], camera: Camera) -> UInt8[n
 
 def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
     """The photograph with the outline of the shape, and the shape."""
-    small = view.resized(min(1.0, SIZE / max(view.camera.height, view.camera.width)))
+    small = view.at_most(SIZE)
     buffers = _rendered(model, step, view.camera)
     picture = (small.image * 255).round().to(torch.uint8).numpy()
     picture[band(buffers.mask, 3).numpy()] = EXTRA

@@ -22,6 +22,13 @@ ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Meshes = Annotated[
     Path, tyro.conf.arg(help="as `distrace data furniture` and `… planes` make them, in folders of their own")
 ]
+Views = Annotated[
+    Path,
+    tyro.conf.arg(
+        metavar="VIEWS",
+        help="a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/",
+    ),
+]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 

@@ -15,7 +15,7 @@ METHODS = ("ours", "hull")
 
 @dataclass(frozen=True)
 class Photographs:
-    """Objects from photographs: by held-out views: ours, and the painted visual hull. A second run goes on."""
+    """Objects from photographs, judged by held-out views: ours, and the painted visual hull. A second run goes on."""
 
     folders: tyro.conf.Positional[tuple[Path, ...]]  # of photographs, as `reconstruct` takes them
     methods: tuple[str, ...] = METHODS
@@ -29,9 +29,7 @@ class Photographs:
         unknown = set(self.methods) - set(METHODS)
         if unknown or not self.folders or self.held_out < 1:
             given = f"methods {', '.join(self.methods)}, {len(self.folders)} folders and --held-out {self.held_out}"
-            raise ValueError(
-                f"{given} were given; give folders, some of {', '.join(METHODS)}, and views to hold out are needed"
-            )
+            raise ValueError(f"{given} were given; give folders, some of {', '.join(METHODS)}, and views to hold out")
         run, rows, evaluations = start(self.out, self.device), [], 0
         for folder in self.folders:
             for method in self.methods:

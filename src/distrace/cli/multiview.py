@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
@@ -11,7 +10,7 @@ import trimesh
 import tyro
 
 from distrace.checkpoint import Model
-from distrace.cli.common import Flag, ModelName, opened, save_mesh
+from distrace.cli.common import Flag, ModelName, Views, opened, save_mesh
 from distrace.cli.console import console, progress, start
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.doubtful import Agreement, agreements
@@ -30,8 +29,7 @@ class Multiview:
     """Find a shape, and where it lies, from photographs with known cameras: no depth, no masks."""
 
     model: tyro.conf.Positional[ModelName]
-    views: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIEWS")]]
-    """a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/"""
+    views: tyro.conf.Positional[Views]
     out: Path = Path("out/multiview")
     starts: int = PhotoConfig.starts
     fixed: Flag = False  # the shape lies in the unit sphere as the model's shapes do; only its code is unknown
@@ -69,7 +67,7 @@ class Multiview:
                 "terms": last.terms,
                 "start": last.start,
                 "T_unit_object": last.place.T_world_object.tolist(),
-                "unit_sphere": {"centre": found.placement.centre.tolist(), "radius": found.placement.radius},
+                "unit_sphere": found.placement.described(),
                 "doubtful": [view.name for view in agreed if view.doubtful],
                 "evaluations": sum(step.evaluations for step in steps),
                 "setup_evaluations": 0,

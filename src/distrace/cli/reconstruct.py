@@ -4,14 +4,13 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import torch
 import tyro
 from PIL import Image
 
-from distrace.cli.common import Flag, save_mesh
+from distrace.cli.common import Flag, Views, save_mesh
 from distrace.cli.console import Run, console, device_name, progress, start
 from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
@@ -20,7 +19,7 @@ from distrace.files import save_json, save_text
 from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
 from distrace.movie import save_gif
-from distrace.reconstruct import COURSE, ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
+from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
 from distrace.shading import grid, save_png
@@ -38,8 +37,7 @@ class Reconstruct:
     They need masks, or a dark background. Run it again to go on after a stop.
     """
 
-    views: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="VIEWS")]]
-    """a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/"""
+    views: tyro.conf.Positional[Views]
     out: Path = Path("out/reconstruct")
     steps: int = ReconstructConfig.steps
     sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
@@ -120,7 +118,7 @@ def fitted(
     saved, due = time.perf_counter(), -(-config.steps // PREVIEWS)
     with progress("reconstructing", config.steps) as bar:
         for step in reconstruct(views, state, config):
-            bar.advance(", ".join(f"{name} {value:.4f}" for name, value in state.course[-1].items()), to=step.step)
+            bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.course.items()), to=step.step)
             if step.step % due == 0:
                 small = judged(state, shown, PREVIEWED)
                 save_png(run.out / "previews" / f"{step.step:07d}.png", small.picture)
@@ -165,20 +163,26 @@ class Made:
             "evaluations of the surface": f"{self.state.evaluations:,}",
             "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
         }
-        course = self.state.course
-        save_text(run.out / "report.html", reconstruction_page(self.name, held_out, some, course, COURSE, mesh, facts))
+        save_text(
+            run.out / "report.html", reconstruction_page(self.name, held_out, some, self.state.course, mesh, facts)
+        )
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
         vertices = torch.from_numpy(np.asarray(mesh.vertices))
         mesh.vertices = self.found.placement.to_world(vertices).numpy()
         save_mesh(run.out / "mesh.ply", mesh)
-        placement = self.found.placement
-        sphere = {"centre": placement.centre.tolist(), "radius": placement.radius}
         rows = [row_of(self.name, self.method, held_out, self.state.seconds)] if held_out else []
         views = {view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out}
-        counted = {"evaluations": self.state.evaluations, "setup_evaluations": 0}
-        run.finish({"rows": rows, "held_out": views, "unit_sphere": sphere, "steps": self.state.step, **counted})
+        result = {
+            "rows": rows,
+            "held_out": views,
+            "unit_sphere": self.found.placement.described(),
+            "steps": self.state.step,
+            "evaluations": self.state.evaluations,
+            "setup_evaluations": 0,
+        }
+        run.finish(result)
         for row in rows:
             console.print(f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}")
 

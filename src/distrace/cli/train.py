@@ -14,6 +14,7 @@ from distrace.checkpoint import Model, save_experiment
 from distrace.cli.common import opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
+from distrace.course import COURSE
 from distrace.data import sampling
 from distrace.data.split import every_mesh, has_meshes, on_side
 from distrace.decoder import NetworkSpecs
@@ -21,7 +22,7 @@ from distrace.render import render
 from distrace.report import View
 from distrace.resume import load_training, save_training
 from distrace.shading import save_png, side_by_side
-from distrace.train import COURSE, Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
+from distrace.train import Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
 from distrace.train import start as start_training
 from distrace.train import train as run_training
 

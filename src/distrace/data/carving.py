@@ -61,13 +61,13 @@ def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor
     reach = math.sqrt(3) * sphere.radius / CELLS
     seen, allowed = torch.zeros(len(places)), torch.zeros(len(places))
     for camera, mask in zip(cameras, masks):
-        inside, hit = _looked_up(camera, mask, places, reach, sphere.centre)
+        inside, hit = _near(camera, mask, places, reach, sphere.centre)
         seen += inside
         allowed += hit
     return places[(seen >= SEEN * len(cameras)) & (allowed >= AGREE * seen)]
 
 
-def _looked_up(
+def _near(
     camera: Camera, mask: Tensor, places: Tensor, reach: float, centre: Tensor
 ) -> tuple[Bool[Tensor, "places"], Bool[Tensor, "places"]]:
     """Which places project into the image, and which of these so near to the mask that their cell may touch it."""
@@ -76,12 +76,19 @@ def _looked_up(
     block = min(block, camera.height, camera.width)
     coarse = torch.nn.functional.max_pool2d(mask[None].float(), block, block, ceil_mode=True)
     coarse = torch.nn.functional.max_pool2d(coarse, 3, 1, 1)[0] > 0
+    return looked_up(camera, coarse, places, block)
+
+
+def looked_up(
+    camera: Camera, mask: Bool[Tensor, "_ _"], places: Float[Tensor, "places 3"], block: int = 1
+) -> tuple[Bool[Tensor, "places"], Bool[Tensor, "places"]]:
+    """Which places project into the image, and which of these into the mask, whose cells are `block` pixels wide."""
     pixels, depths = camera.project(places.to(camera.intrinsics.dtype))
     size = pixels.new_tensor([camera.width, camera.height])
     inside = (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
     column, row = (pixels[inside] / block).long().unbind(-1)
     hit = inside.clone()
-    hit[inside] = coarse[row, column]
+    hit[inside] = mask[row, column]
     return inside, hit
 
 

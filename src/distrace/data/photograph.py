@@ -21,6 +21,17 @@ class Photograph:
     image: Float[Tensor, "height width 3"]
     mask: Bool[Tensor, "height width"] | None = None
 
+    @property
+    def known_mask(self) -> Bool[Tensor, "height width"]:
+        """The mask; raises `ValueError` where there is none."""
+        if self.mask is None:
+            raise ValueError(f"{self.name} has no mask; one is needed that says what is object")
+        return self.mask
+
+    def at_most(self, size: int) -> "Photograph":
+        """Coarser where its longer side has more pixels than that."""
+        return self.resized(min(1.0, size / max(self.camera.height, self.camera.width)))
+
     def resized(self, factor: float) -> "Photograph":
         """The same photograph with coarser pixels, each the mean of the area that it covers.
 

@@ -59,9 +59,7 @@ def save_photographs(folder: Path, photographs: Photographs) -> None:
     if len(set(names)) < len(names):
         names = [f"{k:03d}_{name}" for k, name in enumerate(names)]
     entries = [_saved(folder, name, view, photographs.placement) for name, view in zip(names, photographs.views)]
-    placement = photographs.placement
-    sphere = {"centre": placement.centre.tolist(), "radius": placement.radius}
-    save_json(folder / own.NAME, {"views": entries, "unit_sphere": sphere})
+    save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.placement.described()})
 
 
 def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> Placement:

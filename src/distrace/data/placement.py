@@ -38,6 +38,10 @@ class Placement:
     def camera_to_unit(self, camera: Camera) -> Camera:
         return _moved(camera, self.to_unit(camera.T_world_camera[..., :3, 3]))
 
+    def described(self) -> dict[str, object]:
+        """As `unit_sphere` has it, in views.json and in results."""
+        return {"centre": self.centre.tolist(), "radius": self.radius}
+
     def _centre(self, points: Tensor) -> Tensor:
         # Worlds may lie far from their origin, so a centre in double is not rounded before it is subtracted.
         return self.centre.to(points.device)

@@ -1,0 +1,154 @@
+"""What a reconstruction is told by pixels: colours where object was hit, outlines elsewhere, and what a distance is.
+
+After IDR (Yariv et al., NeurIPS 2020, section 3).
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from distrace.data.photograph import Photograph
+from distrace.field import value_and_gradient
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.surface import attach, minimum
+from distrace.surface_network import ColourNetwork, Surface
+from distrace.targets import band
+from distrace.trace import Trace, TraceConfig, sphere_trace
+
+MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=1e-3, steps=25, least_step=4e-3)
+NEAR_OUTLINE = 31  # pixels across the band from which half of the background's rays are drawn
+FAR_OFF = 0.1  # rays of the background that come no closer have nothing to say
+SHELL = 0.05  # around the surface, in which half of the points lie whose gradient should have length 1
+REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Rays that meet the unit sphere, and what photographs show there."""
+
+    rays: Rays
+    colours: Float[Tensor, "n 3"]
+    is_object: Bool[Tensor, "n"]
+
+    def __getitem__(self, rows: Tensor) -> "Pixels":
+        return Pixels(self.rays[rows], self.colours[rows], self.is_object[rows])
+
+    def to(self, device: torch.device) -> "Pixels":
+        rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
+        return Pixels(rays, self.colours.to(device), self.is_object.to(device))
+
+
+@dataclass(frozen=True)
+class Pool:
+    """All pixels of photographs of one size, from which those of a step are drawn."""
+
+    pixels: Pixels
+    groups: tuple[Tensor, Tensor, Tensor]  # rows of the object, of the background by the outline, of all background
+
+    @staticmethod
+    def of(photographs: Sequence[Photograph], size: int) -> "Pool":
+        """Raises `ValueError` for a photograph without a mask, and for masks without object."""
+        parts = []
+        for each in photographs:
+            coarse = each.at_most(size)
+            mask, rays = coarse.known_mask, coarse.camera.rays().flat()
+            facts = (rays.origins, rays.directions, coarse.image.reshape(-1, 3), mask.reshape(-1))
+            meets = meet_sphere(rays).meets
+            parts.append([part[meets] for part in (*facts, band(mask, NEAR_OUTLINE).reshape(-1))])
+        origins, directions, colours, is_object, near = (torch.cat(part) for part in zip(*parts, strict=True))
+        if not is_object.any():
+            raise ValueError("the masks of the photographs mark no pixel in the unit sphere as object")
+        pixels = Pixels(Rays(origins, directions), colours, is_object)
+        return Pool(pixels, (_rows(is_object), _rows(~is_object & near), _rows(~is_object)))
+
+    def drawn(self, count: int, random: torch.Generator) -> Pixels:
+        """Half of them of the object, a quarter of the background by its outlines."""
+        shares = (count // 2, count // 4, count - count // 2 - count // 4)
+        rows = [
+            group[torch.randint(len(group), (share,), generator=random)]
+            for group, share in zip(self.groups, shares, strict=True)
+            if len(group)
+        ]
+        return self.pixels[torch.cat(rows)]
+
+
+def _rows(some: Bool[Tensor, "n"]) -> Tensor:
+    return some.nonzero()[:, 0]
+
+
+def terms_of(
+    pixels: Pixels, surface: Surface, colour: ColourNetwork, random: torch.Generator, shapes: bool, sharpness: float
+) -> dict[str, Tensor]:
+    """The mean of each term. Colours pull at the surface where they are to tell `shapes`, too."""
+    bounds = meet_sphere(pixels.rays)
+    trace = sphere_trace(surface, pixels.rays, bounds, MARCH)
+    right = trace.hit & pixels.is_object
+    points = pixels.rays[trace.hit].at(trace.distance[trace.hit])
+    return {
+        "colour": colour_term(pixels, trace, right, surface, colour, shapes),
+        "outline": _outline_term(pixels, bounds, trace, ~right, surface, sharpness),
+        "eikonal": _eikonal_term(points, surface, random),
+    }
+
+
+def colour_term(
+    pixels: Pixels, trace: Trace, seen: Bool[Tensor, "n"], surface: Surface, colour: ColourNetwork, shapes: bool
+) -> Float[Tensor, ""]:
+    """The mean absolute difference of colours, as a share of all rays of the object."""
+    rays, distance = pixels.rays[seen], trace.distance[seen]
+    points = rays.at(attach(surface, rays, distance) if shapes else distance)
+    made = coloured(surface, colour, points, rays.directions, shapes)
+    return (made - pixels.colours[seen]).abs().sum() / 3 / pixels.is_object.sum().clamp_min(1)
+
+
+def coloured(
+    surface: Surface,
+    colour: ColourNetwork,
+    points: Float[Tensor, "n 3"],
+    directions: Float[Tensor, "n 3"],
+    shapes: bool = True,
+) -> Float[Tensor, "n 3"]:
+    """Colours of points of the surface; without `shapes` they do not pull at it."""
+    keep = torch.is_grad_enabled()
+    with torch.enable_grad():
+        asked = points if points.requires_grad else points.detach().requires_grad_()
+        value, features = surface.features(asked)
+        (gradient,) = torch.autograd.grad(value.sum(), asked, retain_graph=keep, create_graph=keep and shapes)
+    normals = F.normalize(gradient, dim=-1)
+    if not (keep and shapes):
+        normals, features = normals.detach(), features.detach()
+    return colour(points, normals, directions, features)
+
+
+def _outline_term(
+    pixels: Pixels, bounds: Bounds, trace: Trace, wrong: Bool[Tensor, "n"], surface: Surface, sharpness: float
+) -> Float[Tensor, ""]:
+    """Cross entropy of the rays' least values, where the object was missed or is not; as a share of all rays."""
+    rows = _rows(wrong)
+    with torch.no_grad():
+        close = surface(pixels.rays[rows].at(trace.closest[rows])) < FAR_OFF
+    rows = rows[close | pixels.is_object[rows]]
+    rays, closest = pixels.rays[rows], trace.closest[rows]
+    within = Bounds(bounds.near[rows], bounds.far[rows])
+    values = surface(rays.at(minimum(surface, rays, closest, within, reach=SHELL, refine=REFINED)))
+    object_is_there = pixels.is_object[rows].to(values)
+    lacking = F.binary_cross_entropy_with_logits(-sharpness * values, object_is_there, reduction="sum")
+    return lacking / sharpness / len(wrong)
+
+
+def _eikonal_term(hits: Float[Tensor, "n 3"], surface: Surface, random: torch.Generator) -> Float[Tensor, ""]:
+    """At points anywhere and about the surface (Gropp et al., ICML 2020)."""
+    count = max(len(hits), 1)
+    anywhere = 2 * torch.rand(count, 3, generator=random) - 1
+    about = hits + (SHELL * torch.randn(hits.shape, generator=random)).to(hits)
+    _, gradient = value_and_gradient(surface, torch.cat([anywhere.to(hits), about]))
+    return unit_length(gradient)
+
+
+def unit_length(gradient: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """The mean of (|∇f| − 1)²."""
+    return (gradient.norm(dim=-1) - 1).square().mean()
