@@ -31,7 +31,7 @@ ORDER = [
     *("course", "train", "resume", "prior", "starts", "fit", "fit_samples"),
     *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
     *("regions", "photo_pairs", "photo_residuals", "photo_stage", "fit_photos", "doubtful"),
-    *("surface_network", "hull", "reconstruction_terms", "reconstruct", "reconstruction_run"),
+    *("surface_network", "hull", "matching", "reconstruction_terms", "reconstruct", "reconstruction_run"),
     *(
         "bench",
         "ablation",
@@ -47,6 +47,7 @@ ORDER = [
         "trials",
         "sparse_depth",
         "focal_test",
+        "semi_global",
         "multiview_table",
         "split_table",
         "spread_table",

@@ -24,15 +24,16 @@ from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import value_and_gradient
 from distrace.hull import overlaps, visual_hull
+from distrace.matching import Matching
 from distrace.primitives import box, sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
-from distrace.reconstruction_terms import MARCH, Pool, colour_term, coloured
+from distrace.reconstruction_terms import MARCH, Pool, coloured, terms_of
 from distrace.render import render
 from distrace.surface import attach
-from distrace.surface_network import ColourNetwork, SurfaceNetwork, SurfaceSpecs, squareplus
+from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs, squareplus
 from distrace.trace import sphere_trace
 
 BLACK = torch.zeros(3)
@@ -117,7 +118,7 @@ def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted
 def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reconstruction) -> None:
     """The derivatives of colours by the surface's last bias agree with those of rays traced anew."""
     surface, colour = deepcopy(fitted.surface).double(), deepcopy(fitted.colour).double()
-    rays, bias = Pool.of(views[1:3], 40).pixels.rays, surface.last.bias
+    rays, bias = Pool.of(views[1:3]).pixels.rays, surface.last.bias
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
     march = replace(MARCH, tolerance=1e-10, steps=400, step_scale=0.8)
     trace = sphere_trace(surface, rays, meet_sphere(rays), march)
@@ -183,13 +184,20 @@ def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
 
 
 def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
-    config = replace(SHORT, colours_shape=False)
-    state = Reconstruction.fresh(SMALL, config, CPU)
-    pixels = Pool.of(views, 32).pixels
-    trace = sphere_trace(state.surface, pixels.rays, meet_sphere(pixels.rays), MARCH)
-    colour_term(pixels, trace, trace.hit & pixels.is_object, state.surface, state.colour, False).backward()
-    assert all(weight.grad is None for weight in state.surface.parameters())
-    assert any(weight.grad is not None for weight in state.colour.parameters())
+    state, random = Reconstruction.fresh(SMALL, SHORT, CPU), torch.Generator().manual_seed(0)
+    small = [view.at_most(32) for view in views]
+    some, matching = Pool.of(small).drawn(600, random), Matching.of(small, CPU)
+    surface = CountedSurface(state.surface)
+    for shapes, pulled in ((False, set[str]()), (True, {"colour", "patches"})):
+        terms = terms_of(some, matching, surface, state.colour, random, shapes, 100.0)
+        weights = list(state.surface.parameters())
+        for name in ("colour", "patches"):
+            if terms[name].requires_grad:
+                found = torch.autograd.grad(terms[name], weights, retain_graph=True, allow_unused=True)
+                assert any(each is not None and each.any() for each in found) == (name in pulled)
+            else:
+                assert name not in pulled
+    assert surface.evaluations > 2 * 600
 
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:

@@ -229,3 +229,11 @@ def test_columns_of_numbers_stand_to_the_right_and_columns_with_words_to_the_lef
     drawn = Reader(html.table(("name", "value", "note"), [("chair", "0.25", "7"), ("sofa", "–", "seven")]))
     assert [cell.get("class") for cell in drawn.all("td")] == [None, "number", None] * 2
     assert [cell.get("class") for cell in drawn.all("th")] == [None, "number", None]
+
+
+def test_a_scene_keeps_the_colours_of_vertices_where_there_are_some() -> None:
+    ball = trimesh.creation.icosphere(6)
+    assert len(ball.faces) > scene.MOST_FACES
+    assert "vertexcolor" not in str(scene.scene({"ball": ball}, {}))
+    painted = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=[255, 0, 128], process=False)
+    assert '"vertexcolor":["#ff0080","#ff0080"' in str(scene.scene({"ball": painted}, {}))

@@ -1,4 +1,4 @@
-"""Held-out shapes from clips of them, without depth and masks: against masks alone, and against the training shapes.
+"""Held-out shapes from clips, no depth, no masks: against masks alone, the training shapes, and classical stereo.
 
 The protocol is DIST's (Liu et al., CVPR 2020, section 4.3): cameras are known, the code is not; and beside it the
 shape's place, too, is off at first.
@@ -13,6 +13,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -30,12 +31,14 @@ from distrace.metrics import chamfer
 from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import prior_of
+from distrace.semi_global import stereo_points
 from distrace.sparse_depth import fingerprint, hash_of, true_solid
 from distrace.trials import grouped, opened_once, read_json
 
-METHODS = ("nearest", "silhouettes", "ours", "ours, moved")
+METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")
 KNOWN_PLACE = PhotoConfig(compared=Comparing(moves=False))
 MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size
+STILL = (0.0, 0.0, 0.0)
 RECOVERED = (1.0, 0.02, 0.02)  # to so much, the place counts as found again
 RESOLUTION = 192
 
@@ -66,7 +69,7 @@ class ClipResult:
     degrees: float
     shift: float
     growth: float
-    code: list[float]
+    code: list[float]  # of stereo, none
 
     @property
     def chamfer(self) -> float:
@@ -91,11 +94,15 @@ def clip_done(trial: ClipTrial) -> ClipResult:
         kept = read_json(path)
         if kept.pop("made_by", None) == mark:
             return ClipResult(**kept)
-    began = time.perf_counter()
-    code, off = _found(trial, model, clip)
+    began, code, off = time.perf_counter(), torch.zeros(0), STILL
+    if trial.method == "stereo":
+        found = stereo_points(load_photographs(trial.folder).views)
+    else:
+        code, off = _found(trial, model, clip)
+        found = model.field(code)
     seconds = time.perf_counter() - began
-    truth = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
-    distance = chamfer(extract_mesh(model.field(code), MeshConfig(RESOLUTION)), truth)
+    surface = found if isinstance(found, np.ndarray) else extract_mesh(found, MeshConfig(RESOLUTION))
+    distance = chamfer(surface, true_solid(trial.meshes, clip["split"], clip["shape"]).surface)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
     result = ClipResult(*names, distance.to, distance.from_, seconds, *off, [round(x, 6) for x in code.tolist()])
     save_json(path, {"made_by": mark, **asdict(result)})
@@ -113,25 +120,26 @@ def settings_of(method: str) -> object:
     """What a method follows; raises `ValueError` for another one."""
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS)}")
-    return CodeFitConfig() if method == "silhouettes" else (method, KNOWN_PLACE, MOVED_BY)
+    own = {"silhouettes": CodeFitConfig(), "stereo": None}
+    return own.get(method, (method, KNOWN_PLACE, MOVED_BY))
 
 
 def _found(
     trial: ClipTrial, model: Model, clip: dict[str, Any]
 ) -> tuple[Float[Tensor, "length"], tuple[float, float, float]]:
     """The code, and what the place is off by at the end: degrees, radii, and a part of the size."""
-    prior, nothing = prior_of(model.codes), (0.0, 0.0, 0.0)
+    prior = prior_of(model.codes)
     views = list(load_photographs(trial.folder).views)
     if trial.method == "silhouettes":
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
-        return step.code, nothing
+        return step.code, STILL
     if trial.method == "nearest":
         stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
         best = ranked(model.decoder, stage, prior, KNOWN_PLACE.compared, Similarity.identity())[0]
-        return prior.code(best[1]), nothing
+        return prior.code(best[1]), STILL
     if trial.method == "ours":
         *_, step = fit_photos(model.decoder, views, prior, KNOWN_PLACE)
-        return step.code, nothing
+        return step.code, STILL
     config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=True))
     start = disturbed(hash_of(clip["shape"]))
     *_, last = fit_photos(model.decoder, views, prior, config, start)

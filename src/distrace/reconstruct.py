@@ -14,6 +14,7 @@ from distrace.course import record
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
 from distrace.hull import visual_hull
+from distrace.matching import Matching
 from distrace.reconstruction_terms import SHELL, Pool, terms_of, unit_length
 from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
 
@@ -33,7 +34,9 @@ class ReconstructConfig:
     learning_rate: float = 1e-3  # of the colours' network …
     surface_rate: float = 0.5  # … and × this of the surface's
     last_rate: float = 0.05  # × as much at the end; the rate falls exponentially
-    outline: float = 50.0  # the weights of the terms, to one of the colours' mean absolute difference
+    colour: float = 1.0  # the weights of the terms
+    patches: float = 0.5
+    outline: float = 200.0
     eikonal: float = 1.0
     sharpness: float = 100.0  # of an outline at first, per radius: it doubles …
     sharpenings: int = 3  # … so often, evenly over the steps
@@ -133,19 +136,21 @@ def reconstruct(
     The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
     Raises `ValueError` for photographs without masks, or masks without object.
     """
-    device, size, pool = state.surface.last.weight.device, 0, None
+    device, size = state.surface.last.weight.device, 0
     while state.step < config.steps:
         began = time.perf_counter()
-        if pool is None or config.size(state.step) != size:
+        if config.size(state.step) != size:
             size = config.size(state.step)
-            pool = Pool.of(photographs, size)
+            coarse = [each.at_most(size) for each in photographs]
+            pool, matching = Pool.of(coarse), Matching.of(coarse, device)
         for group in state.optimiser.param_groups:
             group["lr"] = group["share"] * config.rate(state.step)
         random = torch.Generator().manual_seed((config.seed << 32) + state.step)
         some, surface = pool.drawn(config.rays, random).to(device), CountedSurface(state.surface)
-        terms = terms_of(some, surface, state.colour, random, config.shapes(state.step), config.sharp(state.step))
+        shapes, sharp = config.shapes(state.step), config.sharp(state.step)
+        terms = terms_of(some, matching, surface, state.colour, random, shapes, sharp)
         state.evaluations += surface.evaluations
-        weighted = terms["colour"] + config.outline * terms["outline"] + config.eikonal * terms["eikonal"]
+        weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()]).sum()
         state.optimiser.zero_grad()
         weighted.backward()
         torch.nn.utils.clip_grad_norm_(state.surface.parameters(), STEEPEST)

@@ -8,11 +8,13 @@ from statistics import mean
 import numpy as np
 import torch
 import trimesh
+from jaxtyping import Bool, Float
+from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.charts import curves
 from distrace.course import COURSE
-from distrace.data.photograph import Photograph
+from distrace.data.photograph import Photograph, averaged
 from distrace.field import value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import iou
@@ -22,6 +24,8 @@ from distrace.reconstruction_terms import coloured
 from distrace.render import Buffers, render
 from distrace.scene import scene
 from distrace.shading import Picture, mask_comparison, normal_picture, side_by_side
+
+FINER = 2  # rays across a pixel: photographs have means over areas
 
 
 @dataclass(frozen=True)
@@ -41,25 +45,30 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
     Raises `ValueError` for a photograph without a mask.
     """
     view = photograph.at_most(size)
-    buffers, made = seen(state, view)
-    hit, mask, image = buffers.mask.cpu(), view.known_mask, view.image
+    buffers, hit, made = seen(state, view)
+    mask, image = view.known_mask, view.image
     error = (made - image)[mask].square().mean().clamp_min(1e-10)
     pictures = [
         _picture(torch.where(mask[..., None], image, 0.4 * image)),
         _picture(torch.where(hit[..., None], made, 1.0)),
-        normal_picture(buffers.normal, buffers.mask, view.camera.T_world_camera),
+        normal_picture(buffers.normal[::FINER, ::FINER], buffers.mask[::FINER, ::FINER], view.camera.T_world_camera),
         mask_comparison(mask, hit),
     ]
     return Judged(photograph.name, -10 * math.log10(float(error)), iou(mask, hit), side_by_side(pictures))
 
 
 @torch.no_grad()
-def seen(state: Reconstruction, view: Photograph) -> tuple[Buffers, torch.Tensor]:
-    """The surface before a photograph's camera, and its colours: black where it is not hit."""
-    buffers = render(state.surface, view.camera.to(state.surface.last.weight.device))
+def seen(
+    state: Reconstruction, view: Photograph
+) -> tuple[Buffers, Bool[Tensor, "height width"], Float[Tensor, "height width 3"]]:
+    """The surface before a photograph's camera, `FINER` in each direction; pixels of which it covers more than half;
+    and their colours, as a camera has them: means over a pixel's area, of which what is not hit is black."""
+    camera = view.camera.resized(float(FINER)).to(state.surface.last.weight.device)
+    buffers = render(state.surface, camera)
     made = torch.zeros_like(buffers.rays.directions)
     made[buffers.mask] = coloured(state.surface, state.colour, buffers.points, buffers.rays.directions[buffers.mask])
-    return buffers, made.cpu()
+    covered = averaged(buffers.mask[..., None].cpu().float(), 1 / FINER)[..., 0]
+    return buffers, covered > 0.5, averaged(made.cpu(), 1 / FINER).float()
 
 
 @torch.no_grad()

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
+from distrace.matching import ACROSS, Matching
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import attach, minimum
 from distrace.surface_network import ColourNetwork, Surface
@@ -22,6 +23,7 @@ from distrace.trace import Trace, TraceConfig, sphere_trace
 MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=1e-3, steps=25, least_step=4e-3)
 NEAR_OUTLINE = 31  # pixels across the band from which half of the background's rays are drawn
 FAR_OFF = 0.1  # rays of the background that come no closer have nothing to say
+GRAZING = 0.2  # rays that meet the surface more flatly do not slide: they would be thrown off it, and not come back
 SHELL = 0.05  # around the surface, in which half of the points lie whose gradient should have length 1
 REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
 
@@ -33,13 +35,20 @@ class Pixels:
     rays: Rays
     colours: Float[Tensor, "n 3"]
     is_object: Bool[Tensor, "n"]
+    view: Int[Tensor, "n"]  # the photograph's number
+    places: Float[Tensor, "n 2"]  # in the photograph
+    is_inner: Bool[Tensor, "n"]  # all about it is object, too, so that it can be compared as a patch
 
     def __getitem__(self, rows: Tensor) -> "Pixels":
-        return Pixels(self.rays[rows], self.colours[rows], self.is_object[rows])
+        return Pixels(self.rays[rows], *(fact[rows] for fact in self._facts))
 
     def to(self, device: torch.device) -> "Pixels":
         rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
-        return Pixels(rays, self.colours.to(device), self.is_object.to(device))
+        return Pixels(rays, *(fact.to(device) for fact in self._facts))
+
+    @property
+    def _facts(self) -> tuple[Tensor, ...]:
+        return self.colours, self.is_object, self.view, self.places, self.is_inner
 
 
 @dataclass(frozen=True)
@@ -50,19 +59,21 @@ class Pool:
     groups: tuple[Tensor, Tensor, Tensor]  # rows of the object, of the background by the outline, of all background
 
     @staticmethod
-    def of(photographs: Sequence[Photograph], size: int) -> "Pool":
+    def of(photographs: Sequence[Photograph]) -> "Pool":
         """Raises `ValueError` for a photograph without a mask, and for masks without object."""
         parts = []
-        for each in photographs:
-            coarse = each.at_most(size)
-            mask, rays = coarse.known_mask, coarse.camera.rays().flat()
-            facts = (rays.origins, rays.directions, coarse.image.reshape(-1, 3), mask.reshape(-1))
-            meets = meet_sphere(rays).meets
-            parts.append([part[meets] for part in (*facts, band(mask, NEAR_OUTLINE).reshape(-1))])
-        origins, directions, colours, is_object, near = (torch.cat(part) for part in zip(*parts, strict=True))
+        for number, each in enumerate(photographs):
+            mask, rays = each.known_mask, each.camera.rays().flat()
+            meets, near = meet_sphere(rays).meets, band(mask, NEAR_OUTLINE).reshape(-1)
+            view, places = torch.full_like(near, number, dtype=torch.long), each.camera.pixels().reshape(-1, 2)
+            inner = mask & ~band(mask, ACROSS)
+            facts = (each.image.reshape(-1, 3), mask.reshape(-1), view, places, inner.reshape(-1), near)
+            parts.append([part[meets] for part in (rays.origins, rays.directions, *facts)])
+        origins, directions, *facts, near = (torch.cat(part) for part in zip(*parts, strict=True))
+        pixels = Pixels(Rays(origins, directions), *facts)
+        is_object = pixels.is_object
         if not is_object.any():
             raise ValueError("the masks of the photographs mark no pixel in the unit sphere as object")
-        pixels = Pixels(Rays(origins, directions), colours, is_object)
         return Pool(pixels, (_rows(is_object), _rows(~is_object & near), _rows(~is_object)))
 
     def drawn(self, count: int, random: torch.Generator) -> Pixels:
@@ -81,46 +92,50 @@ def _rows(some: Bool[Tensor, "n"]) -> Tensor:
 
 
 def terms_of(
-    pixels: Pixels, surface: Surface, colour: ColourNetwork, random: torch.Generator, shapes: bool, sharpness: float
+    pixels: Pixels,
+    matching: Matching,
+    surface: Surface,
+    colour: ColourNetwork,
+    random: torch.Generator,
+    shapes: bool,
+    sharpness: float,
 ) -> dict[str, Tensor]:
-    """The mean of each term. Colours pull at the surface where they are to tell `shapes`, too."""
+    """The mean of each term. Colours and patches pull at the surface where they are to tell `shapes`."""
     bounds = meet_sphere(pixels.rays)
     trace = sphere_trace(surface, pixels.rays, bounds, MARCH)
     right = trace.hit & pixels.is_object
     points = pixels.rays[trace.hit].at(trace.distance[trace.hit])
+    seen, distance = pixels[right], trace.distance[right]
+    seen_at = seen.rays.at(attach(surface, seen.rays, distance, least_slope=GRAZING) if shapes else distance)
+    normals, features = described(surface, seen_at, shapes)
+    made = colour(seen_at, normals, seen.rays.directions, features)
+    inner = [part[seen.is_inner] for part in (seen.view, seen.places, seen_at, normals)]
     return {
-        "colour": colour_term(pixels, trace, right, surface, colour, shapes),
+        "colour": (made - seen.colours).abs().sum() / 3 / pixels.is_object.sum().clamp_min(1),
+        "patches": matching.term(surface, *inner) if shapes else made.new_zeros(()),
         "outline": _outline_term(pixels, bounds, trace, ~right, surface, sharpness),
         "eikonal": _eikonal_term(points, surface, random),
     }
 
 
-def colour_term(
-    pixels: Pixels, trace: Trace, seen: Bool[Tensor, "n"], surface: Surface, colour: ColourNetwork, shapes: bool
-) -> Float[Tensor, ""]:
-    """The mean absolute difference of colours, as a share of all rays of the object."""
-    rays, distance = pixels.rays[seen], trace.distance[seen]
-    points = rays.at(attach(surface, rays, distance) if shapes else distance)
-    made = coloured(surface, colour, points, rays.directions, shapes)
-    return (made - pixels.colours[seen]).abs().sum() / 3 / pixels.is_object.sum().clamp_min(1)
-
-
-def coloured(
-    surface: Surface,
-    colour: ColourNetwork,
-    points: Float[Tensor, "n 3"],
-    directions: Float[Tensor, "n 3"],
-    shapes: bool = True,
-) -> Float[Tensor, "n 3"]:
-    """Colours of points of the surface; without `shapes` they do not pull at it."""
-    keep = torch.is_grad_enabled()
+def described(
+    surface: Surface, points: Float[Tensor, "n 3"], shapes: bool = True
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n features"]]:
+    """Normals and features at points; without `shapes` nothing pulls at the surface through them."""
+    keep = torch.is_grad_enabled() and shapes
     with torch.enable_grad():
         asked = points if points.requires_grad else points.detach().requires_grad_()
         value, features = surface.features(asked)
-        (gradient,) = torch.autograd.grad(value.sum(), asked, retain_graph=keep, create_graph=keep and shapes)
+        (gradient,) = torch.autograd.grad(value.sum(), asked, retain_graph=keep, create_graph=keep)
     normals = F.normalize(gradient, dim=-1)
-    if not (keep and shapes):
-        normals, features = normals.detach(), features.detach()
+    return (normals, features) if keep else (normals.detach(), features.detach())
+
+
+def coloured(
+    surface: Surface, colour: ColourNetwork, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n 3"]:
+    """Colours of points of the surface, as rays of these directions see them."""
+    normals, features = described(surface, points)
     return colour(points, normals, directions, features)
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import plotly.graph_objects as go
 import trimesh
 from jaxtyping import Float, Int
+from trimesh.visual import ColorVisuals
 
 from distrace.charts import PALETTE
 from distrace.page import Html
@@ -17,7 +18,10 @@ MOST_POINTS = 8_000
 
 
 def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
-    """A view to turn, y up. Each name stands in the legend, which hides and shows it."""
+    """A view to turn, y up, in the colours of the meshes' vertices where they have some.
+
+    Each name stands in the legend, which hides and shows it.
+    """
     surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
     points = [
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
@@ -37,18 +41,28 @@ def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray
 
 
 def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
-    vertices, faces = _decimated(np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    vertices, faces = _decimated(np.hstack([mesh.vertices, _own_colours(mesh)]), np.asarray(mesh.faces))
+    colours = ["#" + colour.tobytes().hex() for colour in vertices[:, 3:].astype(np.uint8)]
     light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
     return go.Mesh3d(
-        **_coordinates(vertices),
+        **_coordinates(vertices[:, :3]),
         **dict(zip("ijk", faces.astype(np.int32).T)),
         name=escape(name),
         color="#cfc3b5",
+        vertexcolor=colours if vertices.shape[1] > 3 else None,
         lighting=light,
         lightposition=dict(x=3, y=-2, z=6),
         showlegend=True,
         hoverinfo="skip",
     )
+
+
+def _own_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Red, green and blue of each vertex; no columns where a mesh has none."""
+    visual = mesh.visual
+    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[:, :3]
+    return np.empty((len(mesh.vertices), 0))
 
 
 def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
@@ -63,13 +77,16 @@ def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
 
 
 def _decimated(
-    vertices: Float[np.ndarray, "n 3"], faces: Int[np.ndarray, "m 3"]
-) -> tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]:
-    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993)."""
-    width = np.ptp(vertices, axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
+    vertices: Float[np.ndarray, "n columns"], faces: Int[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "_ columns"], Int[np.ndarray, "_ 3"]]:
+    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993).
+
+    Whatever else the columns hold than places is averaged with them.
+    """
+    width = np.ptp(vertices[:, :3], axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
     corners, triangles = vertices, faces
     while len(triangles) > MOST_FACES:
-        _, cell = np.unique(np.floor(vertices / width).astype(int), axis=0, return_inverse=True)
+        _, cell = np.unique(np.floor(vertices[:, :3] / width).astype(int), axis=0, return_inverse=True)
         cell = cell.reshape(-1)
         corners = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / np.bincount(cell)[:, None]
         triangles = cell[faces]

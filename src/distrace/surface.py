@@ -16,12 +16,14 @@ PART = 1 << 17  # points whose graph is kept: at 8 × 512 about 2 GiB
 WALK = 20  # rounds downhill: across the unit sphere at a `reach` of 0.1
 
 
-def attach(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+def attach(
+    sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"], *, least_slope: float = LEAST_SLOPE
+) -> Float[Tensor, "*batch"]:
     """The distances of hits, unchanged in value, with their exact derivative dt = −df / (∇f · v).
 
     The implicit function theorem on f(o + t v; θ) = 0 (Niemeyer et al., *DVR*, CVPR 2020; Yariv et al., *IDR*, NeurIPS
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
-    surface tangentially (|∇f · v| < 1e-6) there is no derivative, and none is given.
+    surface tangentially (|∇f · v| < `least_slope`) there is no derivative, and none is given.
     """
     distance, fixed = distance.detach(), rays.detach()
     points = fixed.at(distance)
@@ -32,7 +34,7 @@ def attach(sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"]) -> Float[Ten
     change, slope = value - value.detach(), (gradient * fixed.directions).sum(-1)
     if _moves(rays):
         change = change + (gradient * (rays.at(distance) - points)).sum(-1)
-    flat = slope.abs() < LEAST_SLOPE
+    flat = slope.abs() < least_slope
     return distance - torch.where(flat, 0.0, change / torch.where(flat, 1.0, slope))
 
 

@@ -24,7 +24,7 @@ class SurfaceSpecs:
 
     width: int = 128
     layers: int = 4
-    frequencies: int = 6  # of the positional encoding of points: 2⁰ … 2⁵ · π
+    frequencies: int = 8  # of the positional encoding of points: 2⁰ … 2⁷ · π
     features: int = 32  # that the surface's network hands to the colours'
     colour_width: int = 256
     colour_layers: int = 3

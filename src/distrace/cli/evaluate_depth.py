@@ -123,7 +123,7 @@ class Spread:
 
 @dataclass(frozen=True)
 class Multiview:
-    """Held-out shapes from clips: ours, masks alone, and the best training shape. A second run goes on."""
+    """Held-out shapes from clips: ours, masks alone, the nearest training shape, stereo. A second run goes on."""
 
     clips: tyro.conf.Positional[tuple[Path, ...]]  # folders as `distrace clip` makes them
     methods: tuple[str, ...] = METHODS_OF_CLIPS
