@@ -71,7 +71,7 @@ def views() -> list[Photograph]:
 
 @pytest.fixture(scope="module")
 def fitted(views: list[Photograph]) -> Reconstruction:
-    state = Reconstruction.fresh(SMALL, SHORT, CPU)
+    state = Reconstruction.fresh(SMALL, SHORT, 7, CPU)
     list(reconstruct(views[1:], state, SHORT))
     return state
 
@@ -106,7 +106,7 @@ def test_squareplus_is_smooth_and_close_to_relu() -> None:
 
 
 def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted: Reconstruction) -> None:
-    before = judged(Reconstruction.fresh(SMALL, SHORT, CPU), views[0], 40)
+    before = judged(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
     after = judged(fitted, views[0], 40)
     assert after.silhouette_iou > max(0.9, before.silhouette_iou)
     assert after.psnr > before.psnr + 3
@@ -150,7 +150,7 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photog
     assert hull(0.5 * directions).abs().median() < 0.03
     assert (hull(0.3 * directions) < -0.1).all()
     assert (hull(0.9 * directions) > 0.2).all()
-    state = Reconstruction.fresh(SMALL, SHORT, CPU)
+    state = Reconstruction.fresh(SMALL, SHORT, 8, CPU)
     begin_with_hull(state, ball, SHORT)
     assert state.surface(0.5 * directions).abs().median() < 0.04
 
@@ -158,7 +158,7 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photog
 def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
     empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
     with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
-        begin_with_hull(Reconstruction.fresh(SMALL, SHORT, CPU), empty, SHORT)
+        begin_with_hull(Reconstruction.fresh(SMALL, SHORT, 8, CPU), empty, SHORT)
 
 
 def test_a_view_whose_camera_is_turned_is_named() -> None:
@@ -184,7 +184,7 @@ def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
 
 
 def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
-    state, random = Reconstruction.fresh(SMALL, SHORT, CPU), torch.Generator().manual_seed(0)
+    state, random = Reconstruction.fresh(SMALL, SHORT, 8, CPU), torch.Generator().manual_seed(0)
     small = [view.at_most(32) for view in views]
     some, matching = Pool.of(small).drawn(600, random), Matching.of(small, CPU)
     surface = CountedSurface(state.surface)
@@ -202,9 +202,9 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:
     config, names = replace(SHORT, steps=12, sizes=(16, 32)), [view.name for view in views]
-    whole = Reconstruction.fresh(SMALL, config, CPU)
+    whole = Reconstruction.fresh(SMALL, config, 8, CPU)
     list(reconstruct(views, whole, config))
-    half = Reconstruction.fresh(SMALL, config, CPU)
+    half = Reconstruction.fresh(SMALL, config, 8, CPU)
     for step in reconstruct(views, half, config):
         if step.step == 5:
             break

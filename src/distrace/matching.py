@@ -7,7 +7,7 @@ there, would make what is round smaller: the plane lies outside. So each of thei
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -48,6 +48,10 @@ class Matching:
             partners(cameras, PARTNERS),
         )
         return Matching(*(part.to(device) for part in parts))
+
+    def moved(self, motions: Float[Tensor, "views 4 4"]) -> "Matching":
+        """The same with each view's camera moved; differentiable in the motions."""
+        return replace(self, T_camera_world=self.T_camera_world @ torch.linalg.inv(motions))
 
     def term(
         self,

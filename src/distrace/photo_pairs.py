@@ -69,12 +69,12 @@ def without_light(image: Float[Tensor, "height width channels"]) -> Float[Tensor
 
 def partners(cameras: Sequence[Camera], count: int) -> Int[Tensor, "views count"]:
     """Of each view the others to compare it with, −1 where there are fewer: those apart by about `BEST` degrees, seen
-    from the origin, and by `WIDEST` at most; one at least.
+    from the origin, and by `WIDEST` at most; one at least, if there is another.
     """
     eyes = normalize(torch.stack([camera.T_world_camera[:3, 3] for camera in cameras]), dim=-1)
     degrees = (eyes @ eyes.T).clamp(-1, 1).acos() * (180 / math.pi)
     cost = (degrees / BEST).clamp_min(1e-3).log().abs().fill_diagonal_(torch.inf)
     ranked = cost.argsort(dim=1)[:, : min(count, len(cameras) - 1)]
     too_far = degrees.gather(1, ranked) > WIDEST
-    too_far[:, 0] = False
+    too_far[:, :1] = False
     return ranked.masked_fill(too_far, -1)

@@ -9,12 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace.course import record
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
 from distrace.hull import visual_hull
 from distrace.matching import Matching
+from distrace.motions import motions, relative
 from distrace.reconstruction_terms import SHELL, Pool, terms_of, unit_length
 from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
 
@@ -32,7 +35,8 @@ class ReconstructConfig:
     sizes: tuple[int, ...] = (160, 320)
     rays: int = 1024  # of a step: half of the object, half around it
     learning_rate: float = 1e-3  # of the colours' network …
-    surface_rate: float = 0.5  # … and × this of the surface's
+    surface_rate: float = 0.5  # … and × this of the surface's …
+    camera_rate: float = 0.1  # … and of the cameras' motions; 0 where cameras are known exactly
     last_rate: float = 0.05  # × as much at the end; the rate falls exponentially
     colour: float = 1.0  # the weights of the terms
     patches: float = 0.5
@@ -69,6 +73,7 @@ class Reconstruction:
 
     surface: SurfaceNetwork
     colour: ColourNetwork
+    steps_of_views: Float[Tensor, "views 6"]  # by which each camera is moved: see `motions`
     optimiser: torch.optim.Adam
     step: int = 0
     seconds: float = 0.0  # of all steps
@@ -76,14 +81,20 @@ class Reconstruction:
     course: dict[str, list[float]] = field(default_factory=dict)  # of each term, as `course.py` keeps it
 
     @staticmethod
-    def fresh(specs: SurfaceSpecs, config: ReconstructConfig, device: torch.device) -> "Reconstruction":
+    def fresh(specs: SurfaceSpecs, config: ReconstructConfig, views: int, device: torch.device) -> "Reconstruction":
         torch.manual_seed(config.seed)
         surface, colour = SurfaceNetwork(specs).to(device), ColourNetwork(specs).to(device)
+        steps_of_views = torch.zeros(views, 6, device=device, requires_grad=True)
         groups = [
             {"params": list(surface.parameters()), "share": config.surface_rate},
             {"params": list(colour.parameters()), "share": 1.0},
+            {"params": [steps_of_views], "share": config.camera_rate},
         ]
-        return Reconstruction(surface, colour, torch.optim.Adam(groups, config.learning_rate))
+        return Reconstruction(surface, colour, steps_of_views, torch.optim.Adam(groups, config.learning_rate))
+
+    def motions(self) -> Float[Tensor, "views 4 4"]:
+        """Of the views that are fitted to, in their order."""
+        return motions(relative(self.steps_of_views))
 
     def record(self, terms: dict[str, float], seconds: float) -> None:
         """Counts a step done."""
@@ -147,8 +158,8 @@ def reconstruct(
             group["lr"] = group["share"] * config.rate(state.step)
         random = torch.Generator().manual_seed((config.seed << 32) + state.step)
         some, surface = pool.drawn(config.rays, random).to(device), CountedSurface(state.surface)
-        shapes, sharp = config.shapes(state.step), config.sharp(state.step)
-        terms = terms_of(some, matching, surface, state.colour, random, shapes, sharp)
+        shapes, sharp, moves = config.shapes(state.step), config.sharp(state.step), state.motions()
+        terms = terms_of(some.moved(moves), matching.moved(moves), surface, state.colour, random, shapes, sharp)
         state.evaluations += surface.evaluations
         weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()]).sum()
         state.optimiser.zero_grad()

@@ -84,13 +84,18 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def row_of(name: str, method: str, views: Sequence[Judged], seconds: float) -> dict[str, object]:
-    """A row of the table of photographs: means over views that were held out."""
+def row_of(
+    name: str, method: str, views: Sequence[Judged], aligned: Sequence[Judged], seconds: float
+) -> dict[str, object]:
+    """A row of the table of photographs: means over views that were held out, and over the same with cameras that were
+    brought to agree (`registered`)."""
     return {
         "object": name,
         "method": method,
         "psnr": round(mean(view.psnr for view in views), 2),
         "silhouette_iou": round(mean(view.silhouette_iou for view in views), 4),
+        "psnr_aligned": round(mean(view.psnr for view in aligned), 2),
+        "silhouette_iou_aligned": round(mean(view.silhouette_iou for view in aligned), 4),
         "views_held_out": len(views),
         "seconds": round(seconds),
     }

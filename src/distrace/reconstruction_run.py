@@ -26,6 +26,7 @@ def save_reconstruction(folder: Path, state: Reconstruction, config: Reconstruct
         "course": state.course,
         "surface": state.surface.state_dict(),
         "colour": state.colour.state_dict(),
+        "steps_of_views": state.steps_of_views.detach(),
         "optimiser": state.optimiser.state_dict(),
     }
     with written(folder / NAME) as file:
@@ -39,7 +40,7 @@ def load_reconstruction(
 
     Raises `ValueError` for a damaged checkpoint, or one of other photographs or settings.
     """
-    state, path = Reconstruction.fresh(specs, config, device), folder / NAME
+    state, path = Reconstruction.fresh(specs, config, len(names), device), folder / NAME
     if not path.exists():
         return state
     with explained(f"{path} is not a checkpoint of a reconstruction; move it away to start afresh"):
@@ -49,6 +50,7 @@ def load_reconstruction(
         if not others:
             state.surface.load_state_dict(kept["surface"])
             state.colour.load_state_dict(kept["colour"])
+            state.steps_of_views.data.copy_(kept["steps_of_views"])
             state.optimiser.load_state_dict(kept["optimiser"])
             for name in ("step", "seconds", "evaluations", "course"):
                 setattr(state, name, kept[name])

@@ -30,7 +30,7 @@ REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
 
 @dataclass(frozen=True)
 class Pixels:
-    """Rays that meet the unit sphere, and what photographs show there."""
+    """Rays that meet the unit sphere, as the photographs' cameras were given, and what is seen there."""
 
     rays: Rays
     colours: Float[Tensor, "n 3"]
@@ -41,6 +41,13 @@ class Pixels:
 
     def __getitem__(self, rows: Tensor) -> "Pixels":
         return Pixels(self.rays[rows], *(fact[rows] for fact in self._facts))
+
+    def moved(self, motions: Float[Tensor, "views 4 4"]) -> "Pixels":
+        """The same with each view's rays moved, but for those that leave the unit sphere; differentiable."""
+        turn, shift = motions[self.view, :3, :3], motions[self.view, :3, 3]
+        origins = (turn @ self.rays.origins[..., None])[..., 0] + shift
+        moved = Rays(origins, (turn @ self.rays.directions[..., None])[..., 0])
+        return Pixels(moved, *self._facts)[_rows(meet_sphere(moved.detach()).meets)]
 
     def to(self, device: torch.device) -> "Pixels":
         rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
@@ -100,13 +107,17 @@ def terms_of(
     shapes: bool,
     sharpness: float,
 ) -> dict[str, Tensor]:
-    """The mean of each term. Colours and patches pull at the surface where they are to tell `shapes`."""
-    bounds = meet_sphere(pixels.rays)
-    trace = sphere_trace(surface, pixels.rays, bounds, MARCH)
+    """The mean of each term. Colours and patches pull at the surface where they are to tell `shapes`.
+
+    Differentiable in the rays, too, and in the matching's poses.
+    """
+    rays = pixels.rays.detach()
+    bounds = meet_sphere(rays)
+    trace = sphere_trace(surface, rays, bounds, MARCH)
     right = trace.hit & pixels.is_object
-    points = pixels.rays[trace.hit].at(trace.distance[trace.hit])
+    points = rays[trace.hit].at(trace.distance[trace.hit])
     seen, distance = pixels[right], trace.distance[right]
-    seen_at = seen.rays.at(attach(surface, seen.rays, distance, least_slope=GRAZING) if shapes else distance)
+    seen_at = attached(surface, seen.rays, distance) if shapes else seen.rays.detach().at(distance)
     normals, features = described(surface, seen_at, shapes)
     made = colour(seen_at, normals, seen.rays.directions, features)
     inner = [part[seen.is_inner] for part in (seen.view, seen.places, seen_at, normals)]
@@ -116,6 +127,11 @@ def terms_of(
         "outline": _outline_term(pixels, bounds, trace, ~right, surface, sharpness),
         "eikonal": _eikonal_term(points, surface, random),
     }
+
+
+def attached(surface: Surface, rays: Rays, distance: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
+    """Points that rays hit, which move with the surface and with the rays."""
+    return rays.at(attach(surface, rays, distance, least_slope=GRAZING))
 
 
 def described(
@@ -149,7 +165,7 @@ def _outline_term(
     rows = rows[close | pixels.is_object[rows]]
     rays, closest = pixels.rays[rows], trace.closest[rows]
     within = Bounds(bounds.near[rows], bounds.far[rows])
-    values = surface(rays.at(minimum(surface, rays, closest, within, reach=SHELL, refine=REFINED)))
+    values = surface(rays.at(minimum(surface, rays.detach(), closest, within, reach=SHELL, refine=REFINED)))
     object_is_there = pixels.is_object[rows].to(values)
     lacking = F.binary_cross_entropy_with_logits(-sharpness * values, object_is_there, reduction="sum")
     return lacking / sharpness / len(wrong)

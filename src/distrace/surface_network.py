@@ -48,6 +48,8 @@ class SurfaceNetwork(nn.Module):
         widths = [entered, *[specs.width] * specs.layers]
         self.hidden = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(widths))
         self.last = nn.Linear(specs.width, 1 + specs.features)
+        fading = 2.0 ** (-torch.arange(specs.frequencies) / 2)  # what is smooth is learnt first, and ripples last
+        self.register_buffer("strength", torch.cat([torch.ones(3), fading.repeat(6)]), persistent=False)
         self._begin_as_ball()
 
     def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
@@ -60,7 +62,7 @@ class SurfaceNetwork(nn.Module):
         return out[..., 0], out[..., 1:]
 
     def _trunk(self, points: Tensor) -> Tensor:
-        x = encoded(points, self.specs.frequencies)
+        x = encoded(points, self.specs.frequencies) * self.strength
         for layer in self.hidden:
             x = squareplus(layer(x))
         return x

@@ -18,10 +18,12 @@ from distrace.data.photographs import Photographs, load_photographs, notes
 from distrace.files import save_json, save_text
 from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
+from distrace.motions import moved
 from distrace.movie import save_gif
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.registration import registered
 from distrace.shading import grid, save_png
 from distrace.surface_network import SurfaceSpecs
 
@@ -147,15 +149,17 @@ class Made:
     told: Sequence[Photograph]
     kept_back: Sequence[Photograph]
 
-    def judged(self) -> list[Judged]:
-        """The views that were held out, in the size that was fitted last."""
-        return [judged(self.state, view, self.config.sizes[-1]) for view in self.kept_back]
+    def judged(self, views: Sequence[Photograph]) -> list[Judged]:
+        """Views in the size that was fitted last."""
+        return [judged(self.state, view, self.config.sizes[-1]) for view in views]
 
     def save(self, run: Run, config: MeshConfig) -> None:
         """Mesh in the folder's world, page, film and `result.json`."""
         mesh = coloured_mesh(self.state, config)
-        held_out = self.judged()
-        some = [judged(self.state, view, self.config.sizes[-1]) for view in self.told[:: -(-len(self.told) // TOLD)]]
+        held_out = self.judged(self.kept_back)
+        aligned = self.judged([registered(self.state, view, self.config) for view in self.kept_back])
+        moved_ = [moved(*each) for each in zip(self.told, self.state.motions().detach().cpu(), strict=True)]
+        some = self.judged(moved_[:: -(-len(self.told) // TOLD)])
         facts = {
             "views": f"{len(self.told)}, and {len(held_out)} held out",
             "steps": f"{self.state.step:,} of {self.config.rays} rays",
@@ -172,7 +176,7 @@ class Made:
         vertices = torch.from_numpy(np.asarray(mesh.vertices))
         mesh.vertices = self.found.placement.to_world(vertices).numpy()
         save_mesh(run.out / "mesh.ply", mesh)
-        rows = [row_of(self.name, self.method, held_out, self.state.seconds)] if held_out else []
+        rows = [row_of(self.name, self.method, held_out, aligned, self.state.seconds)] if held_out else []
         views = {view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out}
         result = {
             "rows": rows,

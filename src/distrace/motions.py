@@ -1,0 +1,29 @@
+"""Small motions of photographs' cameras: few are calibrated to a pixel, and no surface pleases views that disagree."""
+
+from dataclasses import replace
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.data.photograph import Photograph
+
+
+def motions(steps: Float[Tensor, "views 6"]) -> Float[Tensor, "views 4 4"]:
+    """Each turns about the middle of the unit sphere, by an axis times an angle, and then shifts."""
+    turn: Tensor = roma.rotvec_to_rotmat(steps[:, :3])  # pyright: ignore[reportAssignmentType]
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(steps).expand(len(steps), 1, 4)
+    return torch.cat([torch.cat([turn, steps[:, 3:, None]], dim=2), last], dim=1)
+
+
+def relative(steps: Float[Tensor, "views 6"]) -> Float[Tensor, "views 6"]:
+    """Without what all of them share: that would move the object, and leave other views behind."""
+    return steps - steps.mean(0)
+
+
+def moved(photograph: Photograph, motion: Float[Tensor, "4 4"]) -> Photograph:
+    """The photograph with its camera moved."""
+    camera = photograph.camera
+    pose = motion.to(camera.T_world_camera) @ camera.T_world_camera
+    return replace(photograph, camera=replace(camera, T_world_camera=pose))
