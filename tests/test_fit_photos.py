@@ -7,6 +7,7 @@ import pytest
 import torch
 from bumpy import bumpy_balls
 from torch import Tensor
+from torch.nn import functional as F
 
 from distrace.boundary import shade
 from distrace.camera import Camera
@@ -20,7 +21,7 @@ from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Rays
-from distrace.regions import Regions
+from distrace.regions import Regions, appearance
 from distrace.render import render
 
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
@@ -117,12 +118,22 @@ def test_colours_seen_on_the_object_alone_are_its_own() -> None:
     red, blue = (
         torch.tensor(c) + 0.05 * torch.randn(500, 3, generator=random) for c in ([0.8, 0.2, 0.2], [0.2, 0.3, 0.8])
     )
-    both = torch.cat([red, blue, blue, red[:50]]).clamp(0, 1)
+    both = F.pad(torch.cat([red, blue, blue, red[:50]]).clamp(0, 1), (0, 1))
     is_object = torch.cat([torch.ones(500), torch.zeros(500), torch.ones(60), torch.zeros(490)]).bool()[: len(both)]
     regions = Regions.of(both, is_object)
-    asked = torch.tensor([[0.8, 0.2, 0.2], [0.2, 0.3, 0.8], [0.5, 0.9, 0.1]])
+    asked = torch.tensor([[0.8, 0.2, 0.2, 0.0], [0.2, 0.3, 0.8, 0.0], [0.5, 0.9, 0.1, 0.0]])
     assert regions.probability(asked[:1]) > 0.8
     assert regions.probability(asked[2:]) == pytest.approx(0.5, abs=1e-3), "never seen"
+
+
+def test_an_object_as_grey_as_what_is_behind_it_is_told_by_its_grain() -> None:
+    image, random = torch.full((40, 40, 3), 0.5), torch.Generator().manual_seed(0)
+    image[10:30, 10:30] += 0.06 * torch.randn(20, 20, 1, generator=random)
+    thought = torch.zeros(40, 40, dtype=torch.bool)
+    thought[8:26, 12:34] = True
+    looks = appearance(image)
+    found = Regions.of(looks.reshape(-1, 4), thought.reshape(-1)).smooth_probability(looks)
+    assert found[13:27, 13:27].min() > 0.5 > found[:7].max()
 
 
 @pytest.mark.parametrize("kind", ["colour", "outline"])

@@ -31,7 +31,8 @@ ORDER = [
     *("course", "train", "resume", "prior", "starts", "fit", "fit_samples"),
     *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
     *("regions", "photo_pairs", "photo_residuals", "photo_stage", "fit_photos", "doubtful"),
-    *("surface_network", "hull", "matching", "reconstruction_terms", "reconstruct", "reconstruction_run"),
+    *("surface_network", "hull", "matching", "motions", "reconstruction_terms", "reconstruct", "reconstruction_run"),
+    "registration",
     *(
         "bench",
         "ablation",

@@ -25,12 +25,14 @@ from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import value_and_gradient
 from distrace.hull import overlaps, visual_hull
 from distrace.matching import Matching
+from distrace.motions import drift, motions, moved, relative
 from distrace.primitives import box, sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
 from distrace.reconstruction_terms import MARCH, Pool, coloured, terms_of
+from distrace.registration import registered
 from distrace.render import render
 from distrace.surface import attach
 from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs, squareplus
@@ -113,6 +115,27 @@ def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted
     assert fitted.evaluations > SHORT.steps * SHORT.rays
     first, last = fitted.course["colour"]
     assert last < first
+
+
+def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]) -> None:
+    steps = torch.tensor([[0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.5], [0.0] * 6])
+    turned, still = motions(steps)
+    assert torch.allclose(turned @ torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([0.0, 1.0, 0.5, 1.0]), atol=1e-6)
+    assert torch.equal(still, torch.eye(4))
+    assert drift(views[0], moved(views[0], still)) == 0.0
+    assert torch.allclose(relative(steps).mean(0), torch.zeros(6), atol=1e-7)
+    nudge = torch.tensor([[0.0, 0.0, 0.0, 0.03, 0.0, 0.0]])
+    pool, there = Pool.of(views[:1]).pixels, Pool.of([moved(views[0], motions(nudge)[0])]).pixels
+    again = pool.moved(motions(nudge))
+    assert torch.allclose(again.rays.origins[0], there.rays.origins[0], atol=1e-6)
+    assert torch.allclose(again.rays.directions.mean(0), there.rays.directions.mean(0), atol=1e-2)
+
+
+def test_a_disturbed_camera_is_found_again(views: list[Photograph], fitted: Reconstruction) -> None:
+    off = moved(views[0], motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
+    found = registered(fitted, off, SHORT)
+    assert drift(views[0], found) < drift(views[0], off) / 2, (drift(views[0], found), drift(views[0], off))
+    assert all(parameter.requires_grad for parameter in fitted.surface.parameters())
 
 
 def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reconstruction) -> None:

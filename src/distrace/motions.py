@@ -27,3 +27,10 @@ def moved(photograph: Photograph, motion: Float[Tensor, "4 4"]) -> Photograph:
     camera = photograph.camera
     pose = motion.to(camera.T_world_camera) @ camera.T_world_camera
     return replace(photograph, camera=replace(camera, T_world_camera=pose))
+
+
+def drift(before: Photograph, after: Photograph) -> float:
+    """By how many pixels a camera that moved shows points elsewhere: the mean over six within the unit sphere."""
+    points = torch.cat([torch.eye(3), -torch.eye(3)]).to(before.camera.intrinsics) / 2
+    (here, _), (there, _) = (each.camera.project(points) for each in (before, after))
+    return float((there - here).norm(dim=-1).mean())

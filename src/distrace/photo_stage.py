@@ -15,7 +15,7 @@ from distrace.photo_residuals import MARCH, Look, PhotoProblem, PhotoWeights, Sh
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.regions import Regions
+from distrace.regions import Regions, appearance
 from distrace.surface import normals
 from distrace.targets import drawn
 from distrace.trace import sphere_trace
@@ -48,6 +48,7 @@ class Stage:
     photographs: Sequence[Photograph]
     pictures: Sequence[Colours]  # what is compared of them
     partners: Int[Tensor, "views count"]  # to compare each view with; -1 where there are fewer
+    looks: Sequence[Float[Tensor, "height width 4"]]  # by which object and background are told apart
     meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
 
     @staticmethod
@@ -56,7 +57,8 @@ class Stage:
         images = [each.image if config.same_light else without_light(each.image) for each in coarse]
         pictures = [Colours.of(image, each.camera) for image, each in zip(images, coarse, strict=True)]
         meets = [meet_sphere(each.camera.rays()).meets.reshape(-1) for each in coarse]
-        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners), meets)
+        looks = [appearance(each.image) for each in coarse]
+        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners), looks, meets)
 
     @torch.no_grad()
     def problem(
@@ -65,11 +67,10 @@ class Stage:
         """Rays drawn anew, what their pixels show by what is known so far, and who else sees it."""
         view, index = self._drawn(config.rays, random)
         rays = self._rays(view, index)
-        colours = self._read(view, index, [each.image for each in self.photographs])
         compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
         in_object, sdf = shape.place.rays_in_object(rays), decoder.field(prior.code(shape.w))
         trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
-        sure = self._certainty(view, index, colours, trace.hit)
+        sure = self._certainty(view, index, trace.hit)
         far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
         kept = (trace.hit | (sure > 0) | (sure < 0) & ~far).nonzero()[:, 0]
         seen = Sightings(rays, view, compared, sure)[kept]
@@ -102,15 +103,13 @@ class Stage:
         parts = [image.reshape(-1, image.shape[-1])[index[view == number]] for number, image in enumerate(images)]
         return torch.cat(parts)
 
-    def _certainty(
-        self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], colours: Float[Tensor, "n 3"], hit: Bool[Tensor, "n"]
-    ) -> Float[Tensor, "n"]:
-        """By the masks where there are some, otherwise by colours: those of hits against all others."""
-        beyond = [each.image.reshape(-1, 3)[~meets] for each, meets in zip(self.photographs, self.meets)]
-        background = torch.cat([colours[~hit], *beyond])
+    def _certainty(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """By the masks where there are some, otherwise by appearance: that of hits against all others."""
+        drawn, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
+        background = torch.cat([drawn[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
         is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
-        regions = Regions.of(torch.cat([colours[hit], background]), is_object)
-        images = [2 * regions.smooth_probability(each.image)[..., None] - 1 for each in self.photographs]
+        regions = Regions.of(torch.cat([drawn[hit], background]), is_object)
+        images = [2 * regions.smooth_probability(looks)[..., None] - 1 for looks in self.looks]
         sure = self._read(view, index, images)[:, 0]
         sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
         for number, each in enumerate(self.photographs):

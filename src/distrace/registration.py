@@ -25,7 +25,7 @@ def registered(state: Reconstruction, photograph: Photograph, config: Reconstruc
     """
     device, view = state.surface.last.weight.device, photograph.at_most(config.sizes[-1])
     pool, alone = Pool.of([view]), Matching.of([view], device)
-    surface, colour = (deepcopy(part).requires_grad_(False) for part in (state.surface, state.colour))
+    surface, colour = deepcopy(state.surface).requires_grad_(False), deepcopy(state.colour).requires_grad_(False)
     step = torch.zeros(1, 6, device=device, requires_grad=True)
     optimiser = torch.optim.Adam([step])
     for count in range(STEPS):

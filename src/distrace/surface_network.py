@@ -48,6 +48,7 @@ class SurfaceNetwork(nn.Module):
         widths = [entered, *[specs.width] * specs.layers]
         self.hidden = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(widths))
         self.last = nn.Linear(specs.width, 1 + specs.features)
+        self.strength: torch.Tensor
         fading = 2.0 ** (-torch.arange(specs.frequencies) / 2)  # what is smooth is learnt first, and ripples last
         self.register_buffer("strength", torch.cat([torch.ones(3), fading.repeat(6)]), persistent=False)
         self._begin_as_ball()

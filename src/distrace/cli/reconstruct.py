@@ -5,29 +5,24 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import numpy as np
 import torch
 import tyro
-from PIL import Image
 
-from distrace.cli.common import Flag, Views, save_mesh
-from distrace.cli.console import Run, console, device_name, progress, start
+from distrace.cli.common import Flag, Views
+from distrace.cli.console import Run, console, progress, start
+from distrace.cli.reconstructed import Reconstructed
 from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
-from distrace.data.photographs import Photographs, load_photographs, notes
-from distrace.files import save_json, save_text
+from distrace.data.photographs import load_photographs, notes
+from distrace.files import save_json
 from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
-from distrace.motions import moved
-from distrace.movie import save_gif
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
-from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.reconstruction_page import judged
 from distrace.reconstruction_run import load_reconstruction, save_reconstruction
-from distrace.registration import registered
-from distrace.shading import grid, save_png
+from distrace.shading import save_png
 from distrace.surface_network import SurfaceSpecs
 
-TOLD = 4  # views that were fitted to, on the page
 PREVIEWS = 40  # of a run, evenly over its steps; they make its film
 PREVIEWED = 160  # pixels along the longer side
 
@@ -65,8 +60,9 @@ class Reconstruct:
                 console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
         state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
-        made = Made(self.views.name, state, self.config, found, told, kept_back)
-        made.save(run, MeshConfig(self.resolution, device=run.device))
+        Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(
+            run, MeshConfig(self.resolution, device=run.device)
+        )
 
     @property
     def config(self) -> ReconstructConfig:
@@ -136,67 +132,3 @@ def _doubt(view: Overlap) -> str:
     return (
         f"{view.name} does not agree with the others: {agreed}; is its camera right? --leave-out {view.name} drops it"
     )
-
-
-@dataclass(frozen=True)
-class Made:
-    """A finished reconstruction, and what it was made from."""
-
-    name: str
-    state: Reconstruction
-    config: ReconstructConfig
-    found: Photographs
-    told: Sequence[Photograph]
-    kept_back: Sequence[Photograph]
-
-    def judged(self, views: Sequence[Photograph]) -> list[Judged]:
-        """Views in the size that was fitted last."""
-        return [judged(self.state, view, self.config.sizes[-1]) for view in views]
-
-    def save(self, run: Run, config: MeshConfig) -> None:
-        """Mesh in the folder's world, page, film and `result.json`."""
-        mesh = coloured_mesh(self.state, config)
-        held_out = self.judged(self.kept_back)
-        aligned = self.judged([registered(self.state, view, self.config) for view in self.kept_back])
-        moved_ = [moved(*each) for each in zip(self.told, self.state.motions().detach().cpu(), strict=True)]
-        some = self.judged(moved_[:: -(-len(self.told) // TOLD)])
-        facts = {
-            "views": f"{len(self.told)}, and {len(held_out)} held out",
-            "steps": f"{self.state.step:,} of {self.config.rays} rays",
-            "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
-            "evaluations of the surface": f"{self.state.evaluations:,}",
-            "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
-        }
-        save_text(
-            run.out / "report.html", reconstruction_page(self.name, held_out, some, self.state.course, mesh, facts)
-        )
-        if held_out:
-            save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
-        _save_film(run.out)
-        vertices = torch.from_numpy(np.asarray(mesh.vertices))
-        mesh.vertices = self.found.placement.to_world(vertices).numpy()
-        save_mesh(run.out / "mesh.ply", mesh)
-        rows = [row_of(self.name, self.method, held_out, aligned, self.state.seconds)] if held_out else []
-        views = {view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out}
-        result = {
-            "rows": rows,
-            "held_out": views,
-            "unit_sphere": self.found.placement.described(),
-            "steps": self.state.step,
-            "evaluations": self.state.evaluations,
-            "setup_evaluations": 0,
-        }
-        run.finish(result)
-        for row in rows:
-            console.print(f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}")
-
-    @property
-    def method(self) -> str:
-        return "ours" if self.config.colours_shape else "hull"
-
-
-def _save_film(folder: Path) -> None:
-    """The previews, one after the other."""
-    pictures = [np.asarray(Image.open(path).convert("RGB")) for path in sorted((folder / "previews").glob("*.png"))]
-    if pictures:
-        save_gif(folder / "forming.gif", np.stack(pictures))

@@ -1,0 +1,115 @@
+"""What `reconstruct` leaves in its folder: mesh, page, film, figures and cameras."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from statistics import median
+
+import numpy as np
+import torch
+import trimesh
+from PIL import Image
+
+from distrace.cli.common import save_mesh
+from distrace.cli.console import Run, console, device_name
+from distrace.data.photograph import Photograph
+from distrace.data.placement import Placement
+from distrace.files import save_text
+from distrace.mesh import MeshConfig
+from distrace.motions import drift, moved
+from distrace.movie import save_gif
+from distrace.reconstruct import ReconstructConfig, Reconstruction
+from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.registration import registered
+from distrace.shading import grid, save_png
+
+TOLD = 4  # views that were fitted to, on the page
+
+
+@dataclass(frozen=True)
+class Reconstructed:
+    """A finished reconstruction, and what it was made from."""
+
+    name: str
+    state: Reconstruction
+    config: ReconstructConfig
+    placement: Placement
+    told: Sequence[Photograph]
+    kept_back: Sequence[Photograph]
+
+    def save(self, run: Run, config: MeshConfig) -> None:
+        """Mesh in the folder's world, page, film and `result.json`."""
+        mesh, held_out = coloured_mesh(self.state, config), self._judged(self.kept_back)
+        self._save_page(run, mesh, held_out)
+        if held_out:
+            save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
+        _save_film(run.out)
+        mesh.vertices = self.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
+        save_mesh(run.out / "mesh.ply", mesh)
+        rows = self._rows(held_out)
+        run.finish(
+            {
+                "rows": rows,
+                "held_out": {
+                    view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out
+                },
+                "unit_sphere": self.placement.described(),
+                "cameras": self._cameras(),
+                "steps": self.state.step,
+                "evaluations": self.state.evaluations,
+                "setup_evaluations": 0,
+            }
+        )
+        for row in rows:
+            console.print(
+                f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}; with their cameras"
+                f" registered {row['psnr_aligned']} dB, {row['silhouette_iou_aligned']}"
+            )
+
+    @cached_property
+    def _refined(self) -> list[Photograph]:
+        """The views that were fitted to, with their cameras as they are now."""
+        return [moved(*each) for each in zip(self.told, self.state.motions().detach().cpu(), strict=True)]
+
+    def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
+        """Views in the size that was fitted last."""
+        return [judged(self.state, view, self.config.sizes[-1]) for view in views]
+
+    def _rows(self, held_out: Sequence[Judged]) -> list[dict[str, object]]:
+        if not held_out:
+            return []
+        aligned = self._judged([registered(self.state, view, self.config) for view in self.kept_back])
+        method = "ours" if self.config.colours_shape else "hull"
+        return [row_of(self.name, method, held_out, aligned, self.state.seconds)]
+
+    def _save_page(self, run: Run, mesh: trimesh.Trimesh, held_out: Sequence[Judged]) -> None:
+        some = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
+        drifts = [drift(*each) for each in zip(self.told, self._refined, strict=True)]
+        facts = {
+            "views": f"{len(self.told)}, and {len(held_out)} held out",
+            "steps": f"{self.state.step:,} of {self.config.rays} rays",
+            "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
+            "evaluations of the surface": f"{self.state.evaluations:,}",
+            "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
+            "cameras moved": f"by {median(drifts):.2f} pixels (median), {max(drifts):.2f} at most",
+        }
+        text = reconstruction_page(self.name, held_out, some, self.state.course, mesh, facts)
+        save_text(run.out / "report.html", text)
+
+    def _cameras(self) -> dict[str, object]:
+        """In the folder's world, and by how many pixels they moved."""
+        return {
+            after.name: {
+                "pixels_moved": round(drift(before, after), 3),
+                "T_world_camera": self.placement.camera_to_world(after.camera).T_world_camera.tolist(),
+            }
+            for before, after in zip(self.told, self._refined, strict=True)
+        }
+
+
+def _save_film(folder: Path) -> None:
+    """The previews, one after the other."""
+    pictures = [np.asarray(Image.open(path).convert("RGB")) for path in sorted((folder / "previews").glob("*.png"))]
+    if pictures:
+        save_gif(folder / "forming.gif", np.stack(pictures))
