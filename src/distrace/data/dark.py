@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from skimage.filters import gaussian, threshold_li
+from skimage.filters import gaussian, sobel, threshold_li, threshold_otsu
 from skimage.measure import label
-from skimage.morphology import disk, opening, remove_small_holes
+from skimage.morphology import dilation, disk, erosion, opening, remove_small_holes, skeletonize
+from skimage.segmentation import watershed
 
 from distrace.data.carving import within_masks
 from distrace.data.photographs import Photographs
@@ -19,6 +20,8 @@ SAMPLED = 200_000  # pixels that tell the background's colours
 NOISE = 1 / 255  # standard deviation of a colour, at least
 THREAD = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
 HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows
+LIT = 4  # pixels: what is between background and object, and deeper in the latter, is its shadow; the rest is lit cloth
+UNSURE = 2  # pixels on each side of an outline, within which its place is where the image changes most
 
 
 def masked(photographs: Photographs) -> Photographs:
@@ -46,8 +49,9 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     """What stands out from the background of all images together: the largest part of each.
 
     Distances from the mean colour of what is dark are measured in its standard deviations (Mahalanobis, 1936), so that
-    cloth that catches some light is still background, for it is grey. Both thresholds are Li's (Li and Tam, Pattern
-    Recognition Letters 1998).
+    cloth that catches some light is still background, for it is grey. What is nearer than Li's threshold (Li and Tam,
+    Pattern Recognition Letters 1998) is background, what is farther than Otsu's (1979) is object; between them, and
+    about them, for thresholds dilate what is bright, a watershed puts the outline where the image changes most.
     """
     colours = np.concatenate([image.numpy().reshape(-1, 3) for image in images])
     colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
@@ -55,14 +59,26 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     dark = colours[bright < threshold_li(bright)]
     whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
     apart = np.linalg.norm((colours - dark.mean(0)) @ whiten.T, axis=-1)
-    threshold = threshold_li(apart)
-    return [torch.from_numpy(_stands_out(image.numpy(), dark.mean(0), whiten, threshold)) for image in images]
+    low = threshold_li(apart)
+    high = max(threshold_otsu(apart), low)
+    return [torch.from_numpy(_stands_out(_apart(image.numpy(), dark.mean(0), whiten), low, high)) for image in images]
 
 
-def _stands_out(image: np.ndarray, mean: np.ndarray, whiten: np.ndarray, threshold: float) -> np.ndarray:
-    smooth = gaussian(image, 1.0, channel_axis=-1)
-    apart = np.linalg.norm((smooth - mean) @ whiten.T, axis=-1)
-    parts = np.asarray(label(opening(apart > threshold, disk(THREAD))))
+def _apart(image: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+    return np.linalg.norm((gaussian(image, 1.0, channel_axis=-1) - mean) @ whiten.T, axis=-1)
+
+
+def _stands_out(apart: np.ndarray, low: float, high: float) -> np.ndarray:
+    about, surely = (_largest(apart > threshold) for threshold in (low, high))
+    core = erosion(surely, disk(UNSURE)) | skeletonize(surely) | erosion(about, disk(LIT))  # a skeleton keeps threads
+    markers = np.where(dilation(about, disk(UNSURE)), 0, 1)
+    markers[core] = 2
+    return np.asarray(watershed(sobel(apart), markers) == 2)
+
+
+def _largest(mask: np.ndarray) -> np.ndarray:
+    """The largest part, without dirt and with its shadows."""
+    parts = np.asarray(label(opening(mask, disk(THREAD))))
     largest = parts == (1 + np.bincount(parts.ravel())[1:].argmax() if parts.any() else -1)
     return np.asarray(remove_small_holes(largest, max_size=round(HOLE * parts.size)))
 
