@@ -105,10 +105,10 @@ class Stage:
 
     def _certainty(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
         """By the masks where there are some, otherwise by appearance: that of hits against all others."""
-        drawn, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
-        background = torch.cat([drawn[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
+        asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
+        background = torch.cat([asked[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
         is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
-        regions = Regions.of(torch.cat([drawn[hit], background]), is_object)
+        regions = Regions.of(torch.cat([asked[hit], background]), is_object)
         images = [2 * regions.smooth_probability(looks)[..., None] - 1 for looks in self.looks]
         sure = self._read(view, index, images)[:, 0]
         sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)

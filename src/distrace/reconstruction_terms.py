@@ -30,7 +30,7 @@ REFINED = 2  # rounds of the search for a ray's least value: to two thousandths
 
 @dataclass(frozen=True)
 class Pixels:
-    """Rays that meet the unit sphere, as the photographs' cameras were given, and what is seen there."""
+    """Rays that meet the unit sphere, and what photographs show there."""
 
     rays: Rays
     colours: Float[Tensor, "n 3"]
@@ -117,7 +117,10 @@ def terms_of(
     right = trace.hit & pixels.is_object
     points = rays[trace.hit].at(trace.distance[trace.hit])
     seen, distance = pixels[right], trace.distance[right]
-    seen_at = attached(surface, seen.rays, distance) if shapes else seen.rays.detach().at(distance)
+    if shapes:
+        seen_at = seen.rays.at(attach(surface, seen.rays, distance, least_slope=GRAZING))
+    else:
+        seen_at = seen.rays.detach().at(distance)
     normals, features = described(surface, seen_at, shapes)
     made = colour(seen_at, normals, seen.rays.directions, features)
     inner = [part[seen.is_inner] for part in (seen.view, seen.places, seen_at, normals)]
@@ -127,11 +130,6 @@ def terms_of(
         "outline": _outline_term(pixels, bounds, trace, ~right, surface, sharpness),
         "eikonal": _eikonal_term(points, surface, random),
     }
-
-
-def attached(surface: Surface, rays: Rays, distance: Float[Tensor, "n"]) -> Float[Tensor, "n 3"]:
-    """Points that rays hit, which move with the surface and with the rays."""
-    return rays.at(attach(surface, rays, distance, least_slope=GRAZING))
 
 
 def described(
@@ -165,7 +163,7 @@ def _outline_term(
     rows = rows[close | pixels.is_object[rows]]
     rays, closest = pixels.rays[rows], trace.closest[rows]
     within = Bounds(bounds.near[rows], bounds.far[rows])
-    values = surface(rays.at(minimum(surface, rays.detach(), closest, within, reach=SHELL, refine=REFINED)))
+    values = surface(rays.at(minimum(surface, rays, closest, within, reach=SHELL, refine=REFINED)))
     object_is_there = pixels.is_object[rows].to(values)
     lacking = F.binary_cross_entropy_with_logits(-sharpness * values, object_is_there, reduction="sum")
     return lacking / sharpness / len(wrong)

@@ -41,6 +41,8 @@ class SurfaceSpecs:
 class SurfaceNetwork(nn.Module):
     """f(point) → signed distance, and what its colour depends on besides: smooth layers on encoded points."""
 
+    strength: Tensor  # of each input
+
     def __init__(self, specs: SurfaceSpecs = SurfaceSpecs()) -> None:
         super().__init__()
         self.specs = specs
@@ -48,7 +50,6 @@ class SurfaceNetwork(nn.Module):
         widths = [entered, *[specs.width] * specs.layers]
         self.hidden = nn.ModuleList(nn.Linear(before, after) for before, after in pairwise(widths))
         self.last = nn.Linear(specs.width, 1 + specs.features)
-        self.strength: torch.Tensor
         fading = 2.0 ** (-torch.arange(specs.frequencies) / 2)  # what is smooth is learnt first, and ripples last
         self.register_buffer("strength", torch.cat([torch.ones(3), fading.repeat(6)]), persistent=False)
         self._begin_as_ball()

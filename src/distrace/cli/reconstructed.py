@@ -72,6 +72,11 @@ class Reconstructed:
         """The views that were fitted to, with their cameras as they are now."""
         return [moved(*each) for each in zip(self.told, self.state.motions().detach().cpu(), strict=True)]
 
+    @cached_property
+    def _drifts(self) -> list[float]:
+        """By how many pixels their cameras moved."""
+        return [drift(*each) for each in zip(self.told, self._refined, strict=True)]
+
     def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
         """Views in the size that was fitted last."""
         return [judged(self.state, view, self.config.sizes[-1]) for view in views]
@@ -85,14 +90,13 @@ class Reconstructed:
 
     def _save_page(self, run: Run, mesh: trimesh.Trimesh, held_out: Sequence[Judged]) -> None:
         some = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
-        drifts = [drift(*each) for each in zip(self.told, self._refined, strict=True)]
         facts = {
             "views": f"{len(self.told)}, and {len(held_out)} held out",
             "steps": f"{self.state.step:,} of {self.config.rays} rays",
             "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
             "evaluations of the surface": f"{self.state.evaluations:,}",
             "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
-            "cameras moved": f"by {median(drifts):.2f} pixels (median), {max(drifts):.2f} at most",
+            "cameras moved": f"by {median(self._drifts):.2f} pixels (median), {max(self._drifts):.2f} at most",
         }
         text = reconstruction_page(self.name, held_out, some, self.state.course, mesh, facts)
         save_text(run.out / "report.html", text)
@@ -100,11 +104,11 @@ class Reconstructed:
     def _cameras(self) -> dict[str, object]:
         """In the folder's world, and by how many pixels they moved."""
         return {
-            after.name: {
-                "pixels_moved": round(drift(before, after), 3),
-                "T_world_camera": self.placement.camera_to_world(after.camera).T_world_camera.tolist(),
+            view.name: {
+                "pixels_moved": round(pixels, 3),
+                "T_world_camera": self.placement.camera_to_world(view.camera).T_world_camera.tolist(),
             }
-            for before, after in zip(self.told, self._refined, strict=True)
+            for view, pixels in zip(self._refined, self._drifts, strict=True)
         }
 
 

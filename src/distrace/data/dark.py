@@ -57,15 +57,16 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
     bright = colours.max(-1)
     dark = colours[bright < threshold_li(bright)]
-    whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
-    apart = np.linalg.norm((colours - dark.mean(0)) @ whiten.T, axis=-1)
+    mean, whiten = dark.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
+    apart = _apart(colours, mean, whiten)
     low = threshold_li(apart)
     high = max(threshold_otsu(apart), low)
-    return [torch.from_numpy(_stands_out(_apart(image.numpy(), dark.mean(0), whiten), low, high)) for image in images]
+    smooth = (gaussian(image.numpy(), 1.0, channel_axis=-1) for image in images)
+    return [torch.from_numpy(_stands_out(_apart(image, mean, whiten), low, high)) for image in smooth]
 
 
-def _apart(image: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
-    return np.linalg.norm((gaussian(image, 1.0, channel_axis=-1) - mean) @ whiten.T, axis=-1)
+def _apart(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+    return np.linalg.norm((colours - mean) @ whiten.T, axis=-1)
 
 
 def _stands_out(apart: np.ndarray, low: float, high: float) -> np.ndarray:
