@@ -1,6 +1,7 @@
 """From a folder of photographs to a mesh by the command, and the table of clips, with painted bumpy balls."""
 
 import json
+import math
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,14 @@ import trimesh
 from bumpy import bumpy_balls
 from test_fit_photos import GREY, TRUE, paint, ring
 
-from distrace import multiview_table
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoint import Model, save_model
 from distrace.cli import main
 from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
 from distrace.fit_photos import PhotoConfig
-from distrace.multiview_table import ClipResult, disturbed, multiview_rows, settings_of
+from distrace.multiview_table import ClipResult, disturbed, left_over, multiview_rows, settings_of
+from distrace.pose import Similarity
 from distrace.render import render
 
 
@@ -80,11 +81,20 @@ def test_a_folder_without_views_ends_in_one_sentence(
 
 def test_a_disturbed_place_is_off_by_what_is_said() -> None:
     for seed in range(4):
-        place = disturbed(seed)
-        degrees, shift, growth = multiview_table._off(place)
-        assert degrees == pytest.approx(10, abs=0.01)
-        assert shift == pytest.approx(0.1, abs=1e-5)
-        assert growth == pytest.approx(0.1, abs=1e-5) or growth == pytest.approx(1 - 1 / 1.1, abs=1e-5)
+        step = disturbed(seed).step_from(Similarity.identity())
+        assert math.degrees(step[:3].norm()) == pytest.approx(10, abs=0.01)
+        assert float(step[3:6].norm()) == pytest.approx(0.1, abs=1e-5)
+        assert abs(math.expm1(abs(float(step[6])))) == pytest.approx(0.1, abs=1e-5)
+
+
+def test_what_is_left_over_is_how_a_surface_was_moved() -> None:
+    box = trimesh.creation.box([1.0, 0.6, 0.3])
+    moved = Similarity.identity().moved(torch.tensor([0.0, 0.05, 0.0, 0.02, 0.0, 0.0, 0.04]))
+    surface = box.copy()
+    surface.vertices = moved.to_world(torch.from_numpy(box.vertices.copy()).float()).numpy()
+    degrees, *others = left_over(surface, box)
+    assert degrees == pytest.approx(math.degrees(0.05), abs=0.3)  # 2.9, by points that are drawn
+    assert others == pytest.approx([0.02, 0.04], abs=0.005)
 
 
 def test_rows_are_medians_of_each_class_background_and_method() -> None:

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
+from statistics import median
 
 import torch
 
@@ -19,10 +20,12 @@ from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
 from distrace.starts import Starts, Step, best_of
+from distrace.whereabouts import whereabouts
 
 SCREENED = 400  # rays on which all training shapes are compared, …
 COMPARED = 1000  # … and those on which the best of them are: one in so many, and no fewer than
 KEPT, FEWEST = 8, 8
+ASKED = 8  # training shapes, of which place is the likelier
 
 
 @dataclass(frozen=True)
@@ -73,8 +76,26 @@ def fit_photos(
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     stages = [Stage.of(photographs, level, config.compared) for level in config.levels]
     there = place or Similarity.identity()
+    if config.compared.moves:
+        typical = min((prior.coordinates(code) for code in prior.codes), key=torch.norm, default=prior.start(0, 0))
+        told = whereabouts(stages[-1], decoder.field(prior.code(typical)), there)
+        there = _likelier(decoder, stages[0], prior, config, (there, told))
     shapes = [Shape(w, there) for w in _starts(decoder, stages[0], prior, config, there)]
     return best_of(config, lambda start: _solved(decoder, stages, prior, config, start, shapes[start]), recent=1)
+
+
+def _likelier(
+    decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, places: Sequence[Similarity]
+) -> Similarity:
+    """The place where a few shapes contradict the photographs least."""
+    few = replace(config.compared, rays=SCREENED)
+    some = prior.codes[:: max(1, -(-len(prior.codes) // ASKED))]
+    shapes = [prior.start(0, config.seed), *(prior.coordinates(code) for code in some)]
+
+    def contradicted(place: Similarity) -> float:
+        return median(_loss(decoder, stage, prior, few, Shape(w, place), config.seed) for w in shapes)
+
+    return min(places, key=contradicted)
 
 
 def ranked(
@@ -109,10 +130,11 @@ def _starts(decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, p
 def _solved(
     decoder: Decoder, stages: Sequence[Stage], prior: Prior, config: PhotoConfig, start: int, shape: Shape
 ) -> Iterator[PhotoStep]:
-    began, done, damping = time.perf_counter(), 0, config.damping
+    began, done, damping, expected = time.perf_counter(), 0, config.damping, shape.place
     random = torch.Generator().manual_seed(config.seed)
     for number, (stage, length) in enumerate(zip(stages, config.stage_lengths, strict=True)):
         problem, look = stage.problem(decoder, prior, shape, config.compared, random)
+        problem.expected = expected
         problem.scale, evaluations = config.scale * config.narrowing**number, 0
         solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
         for found in minimise(problem.residuals, look, problem.moved, solver):

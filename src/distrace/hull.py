@@ -62,27 +62,31 @@ def visual_hull(photographs: Sequence[Photograph]) -> SDF:
     return _hull_of(photographs, WRONG)
 
 
-@torch.no_grad()
 def _hull_of(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> SDF:
     """A share of the masks that see a place, and `least` of them, may leave it out."""
-    steps = (torch.arange(CELLS) + 0.5) * 2 / CELLS - 1
-    places = torch.cartesian_prod(steps, steps, steps)
-    seen, left_out = torch.zeros(len(places)), torch.zeros(len(places))
-    for each in photographs:
-        inside, on_object = looked_up(each.camera, each.known_mask, places)
-        seen += inside
-        left_out += inside & ~on_object
-    solid = (
-        (seen >= max(2.0, SEEN * len(photographs)))
-        & (left_out <= (wrong * seen).clamp_min(least))
-        & (places.norm(dim=-1) < 1)
-    )
+    _, solid = allowed(photographs, CELLS, wrong, least)
     if not solid.any():
         raise ValueError(
             f"nothing lies within the masks of {len(photographs)} views together; are they inverted, or the cameras"
             " others?"
         )
     return _distances(solid.reshape(CELLS, CELLS, CELLS))
+
+
+@torch.no_grad()
+def allowed(
+    photographs: Sequence[Photograph], cells: int, wrong: float = WRONG, least: float = 0.0
+) -> tuple[Float[Tensor, "places 3"], Bool[Tensor, "places"]]:
+    """The middles of cells about the unit sphere, and which of them masks allow: but `wrong` of those that see it."""
+    steps = (torch.arange(cells) + 0.5) * 2 / cells - 1
+    places = torch.cartesian_prod(steps, steps, steps)
+    seen, left_out = torch.zeros(len(places)), torch.zeros(len(places))
+    for each in photographs:
+        inside, on_object = looked_up(each.camera, each.known_mask, places)
+        seen += inside
+        left_out += inside & ~on_object
+    enough = seen >= max(2.0, SEEN * len(photographs))
+    return places, enough & (left_out <= (wrong * seen).clamp_min(least)) & (places.norm(dim=-1) < 1)
 
 
 def _distances(solid: Bool[Tensor, "n n n"]) -> SDF:

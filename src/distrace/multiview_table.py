@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
@@ -27,7 +28,7 @@ from distrace.files import save_json
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.fit_photos import PhotoConfig, fit_photos, ranked
 from distrace.mesh import MeshConfig, extract_mesh
-from distrace.metrics import chamfer
+from distrace.metrics import chamfer, surface_points
 from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -38,8 +39,8 @@ from distrace.trials import grouped, opened_once, read_json
 METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")
 KNOWN_PLACE = PhotoConfig(compared=Comparing(moves=False))
 MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size
-STILL = (0.0, 0.0, 0.0)
-RECOVERED = (1.0, 0.02, 0.02)  # to so much, the place counts as found again
+RECOVERED = (2.0, 0.02, 0.02)  # a fifth of that: to so much, the place counts as found again
+REGISTERED = 10_000  # points of each surface, for what a registration would still move
 RESOLUTION = 192
 
 
@@ -56,7 +57,7 @@ class ClipTrial:
 
 @dataclass(frozen=True)
 class ClipResult:
-    """How far the found surface is from the true one; and the place, where that had been moved."""
+    """How far the found surface is from the true one, in the world; and how it would best be moved there."""
 
     category: str
     shape: str
@@ -94,19 +95,35 @@ def clip_done(trial: ClipTrial) -> ClipResult:
         kept = read_json(path)
         if kept.pop("made_by", None) == mark:
             return ClipResult(**kept)
-    began, code, off = time.perf_counter(), torch.zeros(0), STILL
+    began, code = time.perf_counter(), torch.zeros(0)
     if trial.method == "stereo":
-        found = stereo_points(load_photographs(trial.folder).views)
+        surface: trimesh.Trimesh | np.ndarray = stereo_points(load_photographs(trial.folder).views)
+        seconds = time.perf_counter() - began
     else:
-        code, off = _found(trial, model, clip)
-        found = model.field(code)
-    seconds = time.perf_counter() - began
-    surface = found if isinstance(found, np.ndarray) else extract_mesh(found, MeshConfig(RESOLUTION))
-    distance = chamfer(surface, true_solid(trial.meshes, clip["split"], clip["shape"]).surface)
+        code, place = _found(trial, model, clip)
+        seconds = time.perf_counter() - began
+        surface = extract_mesh(model.field(code), MeshConfig(RESOLUTION))
+        surface.vertices = place.to_world(torch.from_numpy(np.asarray(surface.vertices)).float()).numpy()
+    true = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
+    distance, off = chamfer(surface, true), left_over(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
     result = ClipResult(*names, distance.to, distance.from_, seconds, *off, [round(x, 6) for x in code.tolist()])
     save_json(path, {"made_by": mark, **asdict(result)})
     return result
+
+
+def left_over(surface: trimesh.Trimesh | np.ndarray, true: trimesh.Trimesh) -> tuple[float, float, float]:
+    """What a similarity by iterative closest points still moves a surface by: degrees, radii, and part of its size.
+
+    A code can make a shape larger and the place smaller: neither is right or wrong alone.
+    """
+    points = surface if isinstance(surface, np.ndarray) else surface_points(surface, REGISTERED, seed=0)
+    goal = surface_points(true, REGISTERED, seed=1)
+    kept = {"threshold": 1e-9, "max_iterations": 100, "reflection": False}
+    matrix = torch.from_numpy(trimesh.registration.icp(points, goal, **kept)[0]).float()
+    scale = matrix[:3, :3].det().abs() ** (1 / 3)
+    step = Similarity(matrix[:3, :3] / scale, matrix[:3, 3], scale).step_from(Similarity.identity())
+    return math.degrees(float(step[:3].norm())), float(step[3:6].norm()), abs(math.expm1(float(step[6])))
 
 
 def described(folder: Path) -> dict[str, Any]:
@@ -124,26 +141,21 @@ def settings_of(method: str) -> object:
     return own.get(method, (method, KNOWN_PLACE, MOVED_BY))
 
 
-def _found(
-    trial: ClipTrial, model: Model, clip: dict[str, Any]
-) -> tuple[Float[Tensor, "length"], tuple[float, float, float]]:
-    """The code, and what the place is off by at the end: degrees, radii, and a part of the size."""
-    prior = prior_of(model.codes)
+def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], Similarity]:
+    """The code, and the place."""
+    prior, still = prior_of(model.codes), Similarity.identity()
     views = list(load_photographs(trial.folder).views)
     if trial.method == "silhouettes":
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
-        return step.code, STILL
+        return step.code, still
     if trial.method == "nearest":
         stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
-        best = ranked(model.decoder, stage, prior, KNOWN_PLACE.compared, Similarity.identity())[0]
-        return prior.code(best[1]), STILL
-    if trial.method == "ours":
-        *_, step = fit_photos(model.decoder, views, prior, KNOWN_PLACE)
-        return step.code, STILL
-    config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=True))
-    start = disturbed(hash_of(clip["shape"]))
-    *_, last = fit_photos(model.decoder, views, prior, config, start)
-    return last.code, _off(last.place)
+        best = ranked(model.decoder, stage, prior, KNOWN_PLACE.compared, still)[0]
+        return prior.code(best[1]), still
+    moves = trial.method != "ours"
+    config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=moves))
+    *_, last = fit_photos(model.decoder, views, prior, config, disturbed(hash_of(clip["shape"])) if moves else still)
+    return last.code, last.place
 
 
 def disturbed(seed: int) -> Similarity:
@@ -153,12 +165,6 @@ def disturbed(seed: int) -> Similarity:
     growth = torch.tensor([math.log1p(MOVED_BY[2])]) * (1 - 2 * torch.randint(2, (1,), generator=random))
     step = torch.cat([axis * math.radians(MOVED_BY[0]), shift * MOVED_BY[1], growth])
     return Similarity.identity().moved(step)
-
-
-def _off(place: Similarity) -> tuple[float, float, float]:
-    """From where the shape is: degrees, radii, and a part of its size."""
-    cosine = float(((place.rotation.trace() - 1) / 2).clamp(-1, 1))
-    return math.degrees(math.acos(cosine)), float(place.translation.norm()), abs(float(place.scale) - 1)
 
 
 def _silhouette(folder: Path, view: Photograph) -> View:

@@ -6,7 +6,7 @@ slides along its ray, and with it its place in the other images.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import pairwise
 
 import torch
@@ -29,6 +29,10 @@ ATTENTION = 0.03  # rays of the background that come closer than this are search
 GRAZING = 0.2  # points that are seen more flatly slide as if they were seen so
 SATURATED = 3.0  # scales: outlines that are off by more hardly pull
 REACH, ROUNDS = 0.05, 2  # of the search for the least value
+PLACE_DEVIATIONS = torch.tensor(
+    [0.6] * 3 + [0.2] * 3 + [0.1]
+)  # of the turn, shift, and growth: radians, radii, logarithm
+PLACE = len(PLACE_DEVIATIONS)
 MARCH = TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
 
 
@@ -38,7 +42,8 @@ class PhotoWeights:
 
     colour: float = 1.0
     outline: float = 10.0
-    code: float = 0.02
+    code: float = 0.02  # of all of its coordinates
+    place: float = 0.02  # of each number of it, in its deviations
     colour_scale: float = 0.08  # of colours from 0 to 1
     margin: float = 0.005  # how far the surface is to stay from rays of the background
 
@@ -85,6 +90,7 @@ class PhotoProblem:
     pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     weights: PhotoWeights
     moves: bool  # whether the shape's place is unknown, too
+    expected: Similarity = field(default_factory=Similarity.identity)  # about which the place is thought to be
     scale: float = 0.02  # up to which misplaced outlines count by their squares
     evaluations: int = 0
 
@@ -173,10 +179,11 @@ class PhotoProblem:
         return Residuals(off * shrunk, jacobian, self.weights.outline * sure.abs() / len(look.hit))
 
     def _prior(self, look: Look) -> Residuals:
-        w, places = look.shape.w, 7 if self.moves else 0
-        jacobian = torch.cat([torch.eye(len(w)), torch.zeros(len(w), places)], dim=1).to(w)
-        weights = w.new_full((len(w),), 2 * self.weights.code / len(w) / SMALL**2)
-        return Residuals(SMALL * w, SMALL * jacobian, weights)
+        """The code's coordinates, and how far the place is from where it is thought to be."""
+        w, place = look.shape.w, look.shape.place.step_from(self.expected) / PLACE_DEVIATIONS
+        jacobian = torch.block_diag(torch.eye(len(w)), (1 / PLACE_DEVIATIONS).diag()[:, : PLACE * self.moves])
+        share = torch.cat([w.new_full((len(w),), self.weights.code / len(w)), w.new_full((PLACE,), self.weights.place)])
+        return Residuals(SMALL * torch.cat([w, place]), SMALL * jacobian, 2 * share / SMALL**2)
 
 
 @dataclass(frozen=True)

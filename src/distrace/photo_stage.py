@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from distrace.consensus import agreed
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.field import SDF
@@ -104,13 +105,16 @@ class Stage:
         return torch.cat(parts)
 
     def _certainty(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """By the masks where there are some, otherwise by appearance: that of hits against all others."""
+        """By the masks where there are some, otherwise by appearance: that of hits against all others. What looks like
+        the object where most other views rule it out says nothing."""
         asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
         background = torch.cat([asked[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
         is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
         regions = Regions.of(torch.cat([asked[hit], background]), is_object)
-        images = [2 * regions.smooth_probability(looks)[..., None] - 1 for looks in self.looks]
-        sure = self._read(view, index, images)[:, 0]
+        images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
+        possible = agreed(self.photographs, [image > 0 for image in images])
+        kept = [image.masked_fill((image > 0) & ~shown, 0.0) for image, shown in zip(images, possible, strict=True)]
+        sure = self._read(view, index, [image[..., None] for image in kept])[:, 0]
         sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
         for number, each in enumerate(self.photographs):
             if each.mask is not None:

@@ -103,6 +103,11 @@ class Similarity:
         turned: Tensor = roma.special_procrustes(roma.rotvec_to_rotmat(step[:3]) @ self.rotation)  # pyright: ignore[reportAssignmentType]
         return Similarity(turned, self.translation + step[3:6], self.scale * step[6].exp())
 
+    def step_from(self, other: "Similarity") -> Float[Tensor, "7"]:
+        """By which the other would be moved here."""
+        turn: Tensor = roma.rotmat_to_rotvec(self.rotation @ other.rotation.T)  # pyright: ignore[reportAssignmentType]
+        return torch.cat([turn, self.translation - other.translation, (self.scale / other.scale).log()[None]])
+
     def change(self, points_object: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 7"]:
         """By which the object's field, whose gradient there is given, changes at fixed points of the world as it moves.
 

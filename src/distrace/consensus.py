@@ -1,0 +1,43 @@
+"""What looks like the object in one view, and can be it by the others: a neighbour of its colour is there only once.
+
+After Campbell et al., *Automatic 3D object segmentation in multiple views using volumetric graph-cuts* (BMVC 2007),
+whose cut is a vote of the views here.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from distrace.camera import Camera
+from distrace.data.photograph import Photograph
+from distrace.hull import allowed
+
+CELLS = 48  # along each axis of the cube around the unit sphere
+DISAGREE = 0.15  # of the views that see a place may take it for the background: parts look like that
+
+
+def agreed(photographs: Sequence[Photograph], likely: Sequence[Bool[Tensor, "_ _"]]) -> list[Bool[Tensor, "_ _"]]:
+    """Pixels that show places which most views allow, by what is likely the object in each."""
+    places, solid = allowed(
+        [replace(each, mask=mask) for each, mask in zip(photographs, likely, strict=True)], CELLS, DISAGREE
+    )
+    return [_shown(each.camera, places[solid]) for each in photographs]
+
+
+def _shown(camera: Camera, places: Float[Tensor, "places 3"]) -> Bool[Tensor, "height width"]:
+    """Where a camera sees cells about places."""
+    pixels, depth = camera.project(places)
+    within = (depth > 0) & (pixels >= 0).all(-1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(-1)
+    column, row = pixels[within].long().T
+    shown = torch.zeros(camera.height, camera.width)
+    shown[row, column] = 1.0
+    if not within.any():
+        return shown.bool()
+    cell = math.sqrt(3) / CELLS * float(camera.intrinsics[0, 0] / depth[within].min())  # half a diagonal, in pixels
+    reach = math.ceil(cell)
+    return max_pool2d(shown[None], 2 * reach + 1, 1, reach)[0] > 0

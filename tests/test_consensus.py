@@ -1,0 +1,44 @@
+"""What several views together allow: pixels beside a ball that look like it in one view only."""
+
+import torch
+
+from distrace.camera import Camera
+from distrace.consensus import agreed
+from distrace.data.photograph import Photograph
+from distrace.primitives import sphere
+from distrace.render import render
+
+SIZE = 48
+CAMERAS = [
+    Camera.orbit(36 * k, 10 + 15 * (k % 3), 2.8, height=SIZE, width=SIZE, focal_px=1.25 * SIZE) for k in range(10)
+]
+BLANK = torch.zeros(SIZE, SIZE, 3)
+
+
+def photographs() -> list[Photograph]:
+    return [Photograph(str(k), camera, BLANK) for k, camera in enumerate(CAMERAS)]
+
+
+def masks() -> list[torch.Tensor]:
+    return [render(sphere(0.4), camera).mask for camera in CAMERAS]
+
+
+def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept() -> None:
+    likely = masks()
+    likely[3] = likely[3].clone()
+    likely[3][:8, :8] = True  # a neighbour of the same colour
+    shown = agreed(photographs(), likely)
+    assert not shown[3][:8, :8].any()
+    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
+
+
+def test_what_one_view_lacks_is_kept() -> None:
+    likely = masks()
+    likely[3] = torch.zeros_like(likely[3])
+    shown = agreed(photographs(), likely)
+    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
+
+
+def test_without_anything_likely_nothing_is_possible() -> None:
+    shown = agreed(photographs(), [torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
+    assert not torch.stack(shown).any()

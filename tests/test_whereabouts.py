@@ -1,0 +1,39 @@
+"""Where an object lies, told from photographs of a painted bumpy ball before its shape is known."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from bumpy import bumpy_balls
+from test_fit_photos import COMPARED, GREY, TRUE, photographs, ring
+
+from distrace.data.photograph import Photograph
+from distrace.photo_stage import Stage
+from distrace.pose import Similarity
+from distrace.whereabouts import whereabouts
+
+SHIFTED = Similarity(torch.eye(3), torch.tensor([0.15, -0.1, 0.12]), torch.tensor(0.8))
+
+
+@pytest.fixture(scope="module")
+def views() -> list[Photograph]:
+    return photographs(bumpy_balls(), ring(), SHIFTED)
+
+
+def found(views: list[Photograph]) -> Similarity:
+    return whereabouts(Stage.of(views, 1.0, COMPARED), bumpy_balls().field(TRUE), Similarity.identity())
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool) -> None:
+    if masked:
+        views = [replace(view, mask=((view.image - GREY).abs().amax(-1) > 0.02)) for view in views]
+    there = found(views)
+    assert (there.translation - SHIFTED.translation).norm() < 0.08  # a pixel is 0.04
+    assert float(there.scale) == pytest.approx(0.8, abs=0.05)
+
+
+def test_photographs_of_nothing_say_nothing(views: list[Photograph]) -> None:
+    blank = [replace(view, image=GREY.expand_as(view.image)) for view in views]
+    assert found(blank).scale == 1
+    assert found([replace(view, mask=torch.zeros(view.image.shape[:2]).bool()) for view in views]).scale == 1
