@@ -29,9 +29,7 @@ ATTENTION = 0.03  # rays of the background that come closer than this are search
 GRAZING = 0.2  # points that are seen more flatly slide as if they were seen so
 SATURATED = 3.0  # scales: outlines that are off by more hardly pull
 REACH, ROUNDS = 0.05, 2  # of the search for the least value
-PLACE_DEVIATIONS = torch.tensor(
-    [0.6] * 3 + [0.2] * 3 + [0.1]
-)  # of the turn, shift, and growth: radians, radii, logarithm
+PLACE_DEVIATIONS = torch.tensor([0.6] * 3 + [0.2] * 3 + [0.1])  # of turn, shift, and growth: radians, radii, logarithm
 PLACE = len(PLACE_DEVIATIONS)
 MARCH = TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
 
