@@ -70,7 +70,8 @@ def fit_photos(
     """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
-    place; the one whose loss falls lowest goes on. Raises `ValueError` for fewer than two photographs.
+    place: that given or, if it is unknown and they contradict it less there, where the photographs tell; the one whose
+    loss falls lowest goes on. Raises `ValueError` for fewer than two photographs.
     """
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
