@@ -1,17 +1,15 @@
 """What several views together allow: pixels beside a ball that look like it in one view only."""
 
 import torch
+from test_fit_photos import ring
 
-from distrace.camera import Camera
 from distrace.consensus import agreed
 from distrace.data.photograph import Photograph
 from distrace.primitives import sphere
 from distrace.render import render
 
 SIZE = 48
-CAMERAS = [
-    Camera.orbit(36 * k, 10 + 15 * (k % 3), 2.8, height=SIZE, width=SIZE, focal_px=1.25 * SIZE) for k in range(10)
-]
+CAMERAS = ring(size=SIZE)
 BLANK = torch.zeros(SIZE, SIZE, 3)
 
 

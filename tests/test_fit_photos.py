@@ -175,8 +175,8 @@ def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Ph
 def test_a_code_and_a_place_are_found_together(decoder: Decoder) -> None:
     moved = photographs(decoder, ring(), MOVED)
     config = replace(CONFIG, iterations=20, compared=replace(COMPARED, moves=True))
-    found = fitted(decoder, moved, config)  # of three seeds: 0.15 to 0.18 of the start, by colour alone 0.13 to 0.16
-    assert error(decoder, found, MOVED) < 0.2 * error(decoder, MEAN, MOVED)
+    found = fitted(decoder, moved, config)  # of three seeds: 0.151 to 0.157 of the start
+    assert error(decoder, found, MOVED) < 0.17 * error(decoder, MEAN, MOVED)
 
 
 def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:

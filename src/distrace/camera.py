@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.rays import Rays
@@ -116,6 +116,11 @@ class Camera:
         points_camera = (points_world - centre) @ rotation
         image = points_camera @ self.intrinsics.T
         return image[..., :2] / image[..., 2:], points_camera[..., 2]
+
+    def shows(self, pixels: Float[Tensor, "*points 2"], depths: Float[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
+        """Which projections lie within the image, and before the camera."""
+        size = pixels.new_tensor([self.width, self.height])
+        return (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
 
     def depth(self, distance: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
         """Depth z of what lies at a distance along each pixel's ray."""

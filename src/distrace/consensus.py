@@ -32,7 +32,7 @@ def agreed(photographs: Sequence[Photograph], likely: Sequence[Bool[Tensor, "_ _
 def _shown(camera: Camera, places: Float[Tensor, "places 3"]) -> Bool[Tensor, "height width"]:
     """Where a camera sees cells about places."""
     pixels, depth = camera.project(places)
-    within = (depth > 0) & (pixels >= 0).all(-1) & (pixels < pixels.new_tensor([camera.width, camera.height])).all(-1)
+    within = camera.shows(pixels, depth)
     column, row = pixels[within].long().T
     shown = torch.zeros(camera.height, camera.width)
     shown[row, column] = 1.0

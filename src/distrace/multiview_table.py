@@ -103,7 +103,7 @@ def clip_done(trial: ClipTrial) -> ClipResult:
         code, place = _found(trial, model, clip)
         seconds = time.perf_counter() - began
         surface = extract_mesh(model.field(code), MeshConfig(RESOLUTION))
-        surface.vertices = place.to_world(torch.from_numpy(np.asarray(surface.vertices)).float()).numpy()
+        surface.apply_transform(place.T_world_object.numpy())
     true = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
     distance, off = chamfer(surface, true), left_over(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method

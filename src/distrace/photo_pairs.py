@@ -46,11 +46,6 @@ class Colours:
         moved = (focal[None] - torch.cat([torch.zeros(len(pixels), 2, 2), pixels[..., None]], dim=-1)) @ rotation.T
         return pixels, moved / depth[:, None, None]
 
-    def shows(self, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> Tensor:
-        """Whether places lie within the image, and before the camera."""
-        size = pixels.new_tensor([self.camera.width, self.camera.height])
-        return ((pixels > 0) & (pixels < size)).all(-1) & (depth > 0)
-
 
 def without_light(image: Float[Tensor, "height width channels"]) -> Float[Tensor, "height width channels"]:
     """What is left of an image when its local mean and contrast are taken away: the same in another light.

@@ -136,7 +136,7 @@ class Stage:
         seen = (rays.directions * normal).sum(-1) > FACING
         for number, picture in enumerate(self.pictures):
             some = other == number
-            seen[some] &= picture.shows(*picture.camera.project(place.to_world(points[some])))
+            seen[some] &= picture.camera.shows(*picture.camera.project(place.to_world(points[some])))
         row, other, rays = row[seen], other[seen], rays[seen]
         leaving = Bounds(torch.full_like(rays.origins[:, 0], LEAVING), meet_sphere(rays).far)
         clear = ~sphere_trace(sdf, rays, leaving, MARCH).hit

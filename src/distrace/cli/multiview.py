@@ -87,8 +87,8 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> l
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> trimesh.Trimesh:
     """In the world of the folder."""
     mesh = extract_mesh(model.field(step.code), config)
-    vertices = torch.from_numpy(np.asarray(mesh.vertices)).float()
-    mesh.vertices = found.placement.to_world(step.place.to_world(vertices)).numpy()
+    mesh.apply_transform(step.place.T_world_object.numpy())
+    mesh.vertices = found.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
     return mesh
 
 

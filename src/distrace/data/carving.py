@@ -84,8 +84,7 @@ def looked_up(
 ) -> tuple[Bool[Tensor, "places"], Bool[Tensor, "places"]]:
     """Which places project into the image, and which of these into the mask, whose cells are `block` pixels wide."""
     pixels, depths = camera.project(places.to(camera.intrinsics.dtype))
-    size = pixels.new_tensor([camera.width, camera.height])
-    inside = (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+    inside = camera.shows(pixels, depths)
     column, row = (pixels[inside] / block).long().unbind(-1)
     hit = inside.clone()
     hit[inside] = mask[row, column]
