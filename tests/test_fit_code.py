@@ -151,7 +151,7 @@ def test_two_views_tell_more(decoder: Decoder, view: View) -> None:
 
 
 def test_the_best_of_several_starts_goes_on(decoder: Decoder, view: View) -> None:
-    config = replace(CONFIG, iterations=7, starts=3, trial=2)
+    config = replace(CONFIG, iterations=7, starts=3, trial=2, kept=1)
     steps = list(fit_code(decoder, [view], PRIOR, config))
     assert [(step.start, step.iteration) for step in steps[:6]] == [(s, i) for s in range(3) for i in (1, 2)]
     best = min(steps[1:6:2], key=lambda step: step.loss).start
@@ -160,6 +160,14 @@ def test_the_best_of_several_starts_goes_on(decoder: Decoder, view: View) -> Non
     assert len(steps) <= config.total
     again = list(fit_code(decoder, [view], PRIOR, config))
     assert [step.loss for step in steps] == [step.loss for step in again], "the same seed gives the same steps"
+
+
+def test_the_end_that_contradicts_the_view_least_is_the_result(decoder: Decoder, view: View) -> None:
+    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=3, starts=3, trial=1)))
+    ends = {step.start: step for step in steps}
+    errors = {start: error(decoder, step.code) for start, step in ends.items()}
+    assert steps[-1].start == min(errors, key=lambda start: errors[start])
+    assert steps[-1].evaluations > 0, "judging asks the field, and that is counted"
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])

@@ -1,6 +1,7 @@
 """Several starts: which of them goes on, and how many steps that takes."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import pytest
 import torch
@@ -15,7 +16,7 @@ def run(losses: list[list[float]], starts: Starts, recent: int = 8) -> list[tupl
         for iteration, loss in enumerate(losses[start], 1):
             yield Step(start, iteration, loss, {}, torch.zeros(2), seconds=1.0, evaluations=10)
 
-    return [(step.start, step.iteration, step.seconds) for step in best_of(starts, going, recent)]
+    return [(step.start, step.iteration, step.seconds) for step in best_of(starts, going, recent=recent)]
 
 
 def test_all_are_tried_and_the_best_goes_on() -> None:
@@ -30,6 +31,26 @@ def test_a_trial_is_judged_by_its_last_losses(recent: int, best: int) -> None:
     assert steps[-1][:2] == (best, 4)
 
 
+def test_of_several_that_go_on_the_best_in_the_end_is_given_again() -> None:
+    starts = Starts(iterations=3, starts=3, trial=1, kept=2)
+    steps = run([[4, 3, 1], [9, 1, 0], [5, 4, 2]], starts, recent=1)
+    assert steps == [*((k, 1, 1.0) for k in range(3)), (0, 2, 1.0), (0, 3, 1.0), (2, 2, 1.0), (2, 3, 1.0), (0, 3, 0.0)]
+    assert len(steps) == starts.total
+
+
+def test_a_judge_may_see_the_ends_differently() -> None:
+    starts = Starts(iterations=2, starts=2, trial=1, kept=2)
+
+    def going(start: int) -> Iterator[Step]:
+        yield from (Step(start, iteration, float(start), {}, torch.zeros(2), 1.0, 10) for iteration in (1, 2))
+
+    def judge(step: Step) -> Step:
+        return replace(step, loss=-step.loss, seconds=0.5, evaluations=3)
+
+    *_, last = best_of(starts, going, judge)
+    assert (last.start, last.loss, last.seconds, last.evaluations) == (1, 1.0, 1.0, 6)
+
+
 def test_a_start_that_has_settled_gives_its_last_step_again_which_costs_nothing() -> None:
     assert run([[2, 1], [9, 8]], Starts(iterations=9, starts=2, trial=2))[-1] == (0, 2, 0.0)
 
@@ -37,4 +58,4 @@ def test_a_start_that_has_settled_gives_its_last_step_again_which_costs_nothing(
 def test_a_single_start_is_not_tried() -> None:
     assert run([[3, 2, 1]], Starts(iterations=3, starts=1)) == [(0, 1, 1.0), (0, 2, 1.0), (0, 3, 1.0)]
     assert Starts(iterations=3, starts=1).total == 3
-    assert Starts(iterations=1, starts=4).total == 1
+    assert Starts(iterations=1, starts=4, kept=2).total == 1

@@ -13,13 +13,15 @@ from torch import Tensor
 from distrace.code_residuals import Comparison, Problem, Seen
 from distrace.data.view import View
 from distrace.decoder import Decoder
+from distrace.field import Counted
 from distrace.fit import pools_of
 from distrace.losses import Weights
 from distrace.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.point_residuals import PointProblem
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
-from distrace.starts import Starts, Step, best_of
+from distrace.starts import Judge, Starts, Step, best_of, unjudged
+from distrace.verdict import contradiction
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
 
@@ -29,7 +31,7 @@ class CodeFitConfig(Starts):
     """Steps in stages. Each begins with a look along all rays; deviations beyond an ever smaller scale count less."""
 
     iterations: int = 16
-    trial: int = 4
+    kept: int = 3  # all: what a few iterations reach says little about the end
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
@@ -53,19 +55,27 @@ class CodeFitConfig(Starts):
 def fit_code(
     decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
 ) -> Iterator[Step]:
-    """Fits a code to views. Of several starts the one of the least loss goes on; its last step is the result.
+    """Fits a code to views, from several starts; the end that contradicts the views least is the last step again.
 
     Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
 
+    def seen(random: torch.Generator, depths: int, silhouette: int) -> Seen:
+        return Seen.of([pool.draw(depths, silhouette, random) for pool in pools], config.compared.weights)
+
     def problem(random: torch.Generator, share: float) -> Problem:
-        targets = [pool.draw(config.depth_rays, round(config.mask_rays * share), random) for pool in pools]
-        return Problem(decoder, prior, Seen.of(targets, config.compared.weights), config.compared)
+        some = seen(random, config.depth_rays, round(config.mask_rays * share))
+        return Problem(decoder, prior, some, config.compared)
+
+    def judge(step: Step) -> Step:
+        began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
+        others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
+        loss = contradiction(sdf, others, config.compared.trace)
+        return replace(step, loss=loss, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
     random = torch.Generator().manual_seed(config.seed)
-    some = Seen.of([pool.draw(DEPTHS, SILHOUETTE, random) for pool in pools], config.compared.weights)
-    return _best(decoder, prior, Hints.of(some, random), problem, config)
+    return _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, judge)
 
 
 def fit_points(
@@ -89,10 +99,21 @@ def fit_points(
     return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config)
 
 
-def _best(decoder: Decoder, prior: Prior, hints: Hints, problem_of: ProblemOf, config: CodeFitConfig) -> Iterator[Step]:
+def _best(
+    decoder: Decoder,
+    prior: Prior,
+    hints: Hints,
+    problem_of: ProblemOf,
+    config: CodeFitConfig,
+    judge: Judge[Step] = unjudged,
+) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them."""
     first = first_of(decoder, prior, hints, config.starts, config.seed)
-    steps = best_of(config, lambda start: _solved(problem_of, prior, config, start, first.coordinates[start]), recent=1)
+
+    def run(start: int) -> Iterator[Step]:
+        return _solved(problem_of, prior, config, start, first.coordinates[start])
+
+    steps = best_of(config, run, judge, recent=1)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps

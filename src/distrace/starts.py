@@ -1,4 +1,4 @@
-"""Fitting from several starts, because a loss has many valleys: all are tried, the best goes on alone."""
+"""Fitting from several starts, because a loss has many valleys: all are tried, the best go on to their ends."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -18,12 +18,13 @@ class Starts:
     iterations: int = 150
     starts: int = 3
     trial: int = 20
+    kept: int = 1  # starts that go on after the choice
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if self.iterations < 1 or self.starts < 1:
-            given = f"{self.iterations} iterations and {self.starts} starts"
-            raise ValueError(f"{given} were asked for; both must be at least 1")
+        if min(self.iterations, self.starts, self.kept) < 1:
+            given = f"{self.iterations} iterations and {self.starts} starts, {self.kept} of them kept,"
+            raise ValueError(f"{given} were asked for; each must be at least 1")
 
     @property
     def tried(self) -> int:
@@ -32,7 +33,8 @@ class Starts:
 
     @property
     def total(self) -> int:
-        return self.iterations + self.tried * (self.starts - 1)
+        kept = min(self.kept, self.starts) if self.tried else 1
+        return self.tried * self.starts + (self.iterations - self.tried) * kept + (kept > 1)
 
 
 @dataclass(frozen=True)
@@ -49,23 +51,43 @@ class Step:
 
 
 Stepped = TypeVar("Stepped", bound=Step)
+Judge = Callable[[Stepped], Stepped]
+"""From a last step to one whose loss says how good that is, with the time and the evaluations that this took."""
 
 
-def best_of(starts: Starts, run: Callable[[int], Iterator[Stepped]], recent: int = RECENT) -> Iterator[Stepped]:
-    """The steps of all trials, then those of the start whose last losses are the least; the last step is the result."""
+def unjudged(step: Stepped) -> Stepped:
+    """Its own loss tells."""
+    return replace(step, seconds=0.0, evaluations=0)
+
+
+def best_of(
+    starts: Starts, run: Callable[[int], Iterator[Stepped]], judge: Judge[Stepped] = unjudged, recent: int = RECENT
+) -> Iterator[Stepped]:
+    """The steps of all trials, then those of the starts whose last losses are the least; the last step is the result.
+
+    Of several that go on the judge tells which is best: that one's step is given again, with what judging took.
+    """
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
         yield from runs[0]
         return
-    trials: list[list[Stepped]] = []
+    tried: list[list[Stepped]] = []
     for going in runs:
-        trials.append([])
+        tried.append([])
         for step in islice(going, starts.tried):
             yield step
-            trials[-1].append(step)
-    best = min(range(len(trials)), key=lambda start: _mean_loss(trials[start][-recent:]))
-    yield next(runs[best], None) or replace(trials[best][-1], seconds=0.0, evaluations=0)  # it may have settled
-    yield from runs[best]
+            tried[-1].append(step)
+    order = sorted(range(len(tried)), key=lambda start: _mean_loss(tried[start][-recent:]))[: starts.kept]
+    ends, latest = {start: tried[start][-1] for start in order}, tried[-1][-1]
+    for start in order:
+        for latest in runs[start]:
+            yield latest
+            ends[start] = latest
+    verdicts = [(judge if len(ends) > 1 else unjudged)(end) for end in ends.values()]
+    best = min(zip(verdicts, ends.values(), strict=True), key=lambda pair: pair[0].loss)[1]
+    if len(ends) > 1 or best is not latest:
+        seconds, evaluations = sum(v.seconds for v in verdicts), sum(v.evaluations for v in verdicts)
+        yield replace(best, seconds=seconds, evaluations=evaluations)
 
 
 def _mean_loss(steps: Sequence[Step]) -> float:

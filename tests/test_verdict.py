@@ -1,0 +1,46 @@
+"""What of a view a surface contradicts: depths up to a limit, and the share of the silhouette that is wrong."""
+
+import pytest
+import torch
+
+from distrace.camera import Camera
+from distrace.code_residuals import Comparison, Seen
+from distrace.data.view import View
+from distrace.losses import Weights
+from distrace.primitives import sphere
+from distrace.render import render
+from distrace.targets import Pool
+from distrace.verdict import MOST, contradiction
+
+CAMERA = Camera.orbit(30, 20, 3.0, height=48, width=48, focal_px=60.0)
+TRACE = Comparison().trace
+
+
+def seen(depths: int = 500) -> Seen:
+    """A ball of radius 0.5."""
+    buffers = render(sphere(0.5), CAMERA)
+    view = View(CAMERA, buffers.depth, buffers.mask)
+    pool = Pool.of(view.without("depth") if not depths else view)
+    return Seen.of([pool.draw(depths, 3000, torch.Generator().manual_seed(0))], Weights())
+
+
+def test_what_was_seen_contradicts_nothing() -> None:
+    assert contradiction(sphere(0.5), seen(), TRACE) < 5e-3
+
+
+@pytest.mark.parametrize("radius", [0.45, 0.55])
+def test_depths_that_are_off_do(radius: float) -> None:
+    assert 0.05 < contradiction(sphere(radius), seen(), TRACE) < 2 * MOST, "no ray is nearer than the radii are"
+
+
+@pytest.mark.parametrize("radius", [0.4, 0.6])
+def test_outlines_that_are_off_do(radius: float) -> None:
+    some = seen(0)
+    nearest = torch.linalg.cross(some.rays.origins, some.rays.directions).norm(dim=-1)
+    ball, found = nearest < 0.5, nearest < radius
+    share = (ball != found).sum() / (ball | found).sum()
+    assert contradiction(sphere(radius), some, TRACE) == pytest.approx(MOST * float(share), rel=0.1)
+
+
+def test_no_ray_counts_for_more_than_it_can_tell() -> None:
+    assert contradiction(sphere(0.01), seen(), TRACE) == pytest.approx(2 * MOST, rel=0.05)
