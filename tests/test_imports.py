@@ -29,7 +29,17 @@ ORDER = [
     *("differences", "moves", "retrace", "gradcheck", "dist_gradient"),
     *("losses", "warp", "metrics", "mesh", "data", "targets", "sight"),
     *("course", "train", "resume", "prior", "starts", "fit", "fit_samples"),
-    *("solver", "code_residuals", "nearest", "point_residuals", "fit_code", "alignment", "blurred", "fit_camera"),
+    *(
+        "solver",
+        "code_residuals",
+        "nearest",
+        "verdict",
+        "point_residuals",
+        "fit_code",
+        "alignment",
+        "blurred",
+        "fit_camera",
+    ),
     *(
         "hull",
         "consensus",

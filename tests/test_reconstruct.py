@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -17,16 +17,17 @@ from test_fit_photos import TRUE, paint, ring
 from torch.nn import functional as F
 
 from distrace.boundary import shade
+from distrace.camera import Camera
 from distrace.cli import main
 from distrace.cli.reconstruct import parted, without
 from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
-from distrace.field import value_and_gradient
+from distrace.field import SDF, value_and_gradient
 from distrace.hull import overlaps, visual_hull
 from distrace.matching import Matching
 from distrace.motions import drift, motions, moved, relative
-from distrace.primitives import box, sphere
+from distrace.primitives import box, sphere, torus
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
@@ -184,20 +185,38 @@ def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
         begin_with_hull(Reconstruction.fresh(SMALL, SHORT, 8, CPU), empty, SHORT)
 
 
-def test_a_view_whose_camera_is_turned_is_named() -> None:
-    cameras, slab = [camera.resized(2.0) for camera in ring(16, 40)], box(torch.tensor([0.1, 0.6, 0.2]))
+def seen_by(sdf: SDF, cameras: Sequence[Camera]) -> list[Photograph]:
     with torch.no_grad():
-        masks = [render(slab, camera).mask for camera in cameras]
-    seen = [
-        Photograph(f"{number:02}", camera, torch.ones(80, 80, 3), mask)
-        for number, (camera, mask) in enumerate(zip(cameras, masks, strict=True))
-    ]
-    assert not any(view.doubtful for view in overlaps(seen))
+        masks = [render(sdf, camera).mask for camera in cameras]
+    images = [torch.ones(*mask.shape, 3) for mask in masks]
+    return [Photograph(f"{number:02}", *parts) for number, parts in enumerate(zip(cameras, images, masks, strict=True))]
+
+
+def turned(view: Photograph, degrees: float) -> Photograph:
+    """The same photograph, its camera said to be turned about the world's x axis."""
     turn = torch.eye(4)
-    turn[:3, :3] = roma.rotvec_to_rotmat(torch.tensor([math.radians(15.0), 0.0, 0.0]))
-    wrong = replace(cameras[2], T_world_camera=turn @ cameras[2].T_world_camera)
-    found = overlaps([*seen[:2], replace(seen[2], camera=wrong), *seen[3:]])
+    turn[:3, :3] = roma.rotvec_to_rotmat(torch.tensor([math.radians(degrees), 0.0, 0.0]))
+    return replace(view, camera=replace(view.camera, T_world_camera=turn @ view.camera.T_world_camera))
+
+
+def test_a_view_whose_camera_is_turned_is_named() -> None:
+    seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
+    assert not any(view.doubtful for view in overlaps(seen))
+    found = overlaps([*seen[:2], turned(seen[2], 15.0), *seen[3:]])
     assert [view.name for view in found if view.doubtful] == ["02"]
+
+
+def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
+    around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
+    above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
+    *_, last = overlaps(seen_by(torus(0.5, 0.15), [*around, above]))
+    assert last.iou < 0.85, "the hull of the others has no hole"
+    assert not last.doubtful
+    aside = above.T_world_camera.clone()
+    aside[0, 3] += 0.5
+    *others, wrong = seen_by(torus(0.5, 0.15), [*around, above])
+    wrong = replace(wrong, camera=replace(above, T_world_camera=aside))
+    assert overlaps([*others, wrong])[-1].doubtful, "it rules out a part that others show"
 
 
 def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:

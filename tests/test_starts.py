@@ -59,3 +59,17 @@ def test_a_single_start_is_not_tried() -> None:
     assert run([[3, 2, 1]], Starts(iterations=3, starts=1)) == [(0, 1, 1.0), (0, 2, 1.0), (0, 3, 1.0)]
     assert Starts(iterations=3, starts=1).total == 3
     assert Starts(iterations=1, starts=4, kept=2).total == 1
+
+
+@pytest.mark.parametrize(
+    ("starts", "said"),
+    [
+        (Starts(iterations=9, starts=1), "9 of 1 start"),
+        (Starts(iterations=9, starts=3, trial=2), "9 of 1 start, after 2 of each of 3"),
+        (Starts(iterations=9, starts=3, trial=2, kept=2), "9 of 2 starts, after 2 of each of 3"),
+        (Starts(iterations=9, starts=3, trial=2, kept=5), "9 of 3 starts"),
+        (Starts(iterations=1, starts=3, kept=3), "1 of 1 start, after 0 of each of 3"),
+    ],
+)
+def test_a_plan_says_what_it_does(starts: Starts, said: str) -> None:
+    assert str(starts) == said

@@ -19,7 +19,7 @@ from distrace.losses import Weights
 from distrace.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.point_residuals import PointProblem
 from distrace.prior import Prior
-from distrace.solver import SolverConfig, charbonnier, minimise
+from distrace.solver import Kernel, SolverConfig, cauchy, charbonnier, minimise
 from distrace.starts import Judge, Starts, Step, best_of, unjudged
 from distrace.verdict import contradiction
 
@@ -28,7 +28,10 @@ ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
 
 @dataclass(frozen=True)
 class CodeFitConfig(Starts):
-    """Steps in stages. Each begins with a look along all rays; deviations beyond an ever smaller scale count less."""
+    """Steps in stages. Each begins with a look along all rays; deviations beyond a scale count less.
+
+    In the first stages, whose scale narrows, by their absolute values; in the last ones hardly.
+    """
 
     iterations: int = 16
     kept: int = 3  # all: what a few iterations reach says little about the end
@@ -39,12 +42,20 @@ class CodeFitConfig(Starts):
     compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.42  # … and × this from one stage to the next
+    outlying: float = 0.01  # the scale of the last stages …
+    robust: int = 2  # … and how many these are
     damping: float = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.stages < 1:
             raise ValueError(f"{self.stages} stages were asked for; there must be at least 1")
+
+    def judging(self, stage: int) -> tuple[float, Kernel]:
+        """A stage's scale, and how what is beyond it counts."""
+        if stage >= self.stages - self.robust:
+            return self.outlying, cauchy
+        return self.scale * self.narrowing**stage, charbonnier
 
     @property
     def stage_lengths(self) -> list[int]:
@@ -130,9 +141,9 @@ def _solved(
     for stage, length in enumerate(config.stage_lengths):
         if stage < 2:
             problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
-        problem.scale = config.scale * config.narrowing**stage
+        problem.scale, kernel = config.judging(stage)
         state = problem.look(w, state)
-        solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=charbonnier, settled=0.0)
+        solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
         for solution in minimise(problem.residuals, state, problem.moved, solver):
             state, damping, done = solution.state, solution.damping, done + 1
             terms = problem.terms(state, solution.residuals)

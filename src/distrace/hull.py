@@ -5,7 +5,7 @@ Laurentini, *The visual hull concept for silhouette-based image understanding*, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from statistics import median
+from statistics import mean, median
 
 import torch
 from jaxtyping import Bool, Float
@@ -26,7 +26,8 @@ WRONG = 0.05  # of the masks that see a place may leave it out …
 ONE_WRONG = 0.1  # … and so many, one at least, where it is to be found out which are wrong
 COARSE = 96  # pixels along the longer side, of views that are compared
 FAR_OFF = 2.5  # × the median over views: a view whose outline is off by more is doubtful …
-NOTICEABLE = 0.15  # … if so much of it is, too
+NOTICEABLE = 0.15  # … if so much of it is, too, …
+MISSED = 0.01  # … unless the others' overlaps hardly lack what it rules out
 MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=2e-3, steps=60, least_step=4e-3)
 
 
@@ -45,13 +46,39 @@ def overlaps(photographs: Sequence[Photograph]) -> list[Overlap]:
 
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
-    hull, found = _hull_of(photographs, ONE_WRONG, least=1.0), []
-    for each in photographs:
-        coarse = each.at_most(COARSE)
-        rays = coarse.camera.rays()
-        found.append(iou(sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit, coarse.known_mask))
+    places, solid = _allowed(photographs, ONE_WRONG, least=1.0)
+    views = [each.at_most(COARSE) for each in photographs]
+    found = _ious(solid, views)
     limit = max(NOTICEABLE, FAR_OFF * median(1 - iou for iou in found))
-    return [Overlap(each.name, iou, 1 - iou > limit) for each, iou in zip(photographs, found, strict=True)]
+
+    def doubtful(number: int) -> bool:
+        if 1 - found[number] <= limit:
+            return False
+        own, *others = _with_own(photographs[number], views, number, places, solid)
+        before = mean(iou for each, iou in enumerate(found) if each != number)
+        return 1 - own > limit or mean(others) < before - MISSED
+
+    return [Overlap(each.name, found[number], doubtful(number)) for number, each in enumerate(photographs)]
+
+
+def _with_own(
+    photograph: Photograph, views: Sequence[Photograph], number: int, places: Tensor, solid: Tensor
+) -> list[float]:
+    """The overlap of one view, and of all others, where its mask alone may rule places out.
+
+    That may be what hardly another sees, and then nothing else lacks it; a wrong camera takes away what others show.
+    """
+    inside, on_object = looked_up(photograph.camera, photograph.known_mask, places)
+    return _ious(solid & ~(inside & ~on_object), [views[number], *views[:number], *views[number + 1 :]])
+
+
+def _ious(solid: Bool[Tensor, "places"], views: Sequence[Photograph]) -> list[float]:
+    """Of each view's mask and of what its camera sees of a solid."""
+    hull, found = _distances(solid.reshape(CELLS, CELLS, CELLS)), []
+    for each in views:
+        rays = each.camera.rays()
+        found.append(iou(sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit, each.known_mask))
+    return found
 
 
 def visual_hull(photographs: Sequence[Photograph]) -> SDF:
@@ -59,18 +86,18 @@ def visual_hull(photographs: Sequence[Photograph]) -> SDF:
 
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
-    return _hull_of(photographs, WRONG)
+    return _distances(_allowed(photographs, WRONG)[1].reshape(CELLS, CELLS, CELLS))
 
 
-def _hull_of(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> SDF:
-    """A share of the masks that see a place, and `least` of them, may leave it out."""
-    _, solid = allowed(photographs, CELLS, wrong, least)
+def _allowed(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> tuple[Tensor, Tensor]:
+    """On the finest grid; a share of the masks that see a place, and `least` of them, may leave it out."""
+    places, solid = allowed(photographs, CELLS, wrong, least)
     if not solid.any():
         raise ValueError(
             f"nothing lies within the masks of {len(photographs)} views together; are they inverted, or the cameras"
             " others?"
         )
-    return _distances(solid.reshape(CELLS, CELLS, CELLS))
+    return places, solid
 
 
 @torch.no_grad()

@@ -20,7 +20,7 @@ from distrace.methods import completing
 from distrace.prior import DEVIATION, Prior, prior_of
 from distrace.starts import Step
 
-CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3)
+CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0)
 
 
 def plausible(

@@ -32,9 +32,18 @@ class Starts:
         return min(self.trial, self.iterations - 1) if self.starts > 1 else 0
 
     @property
+    def going_on(self) -> int:
+        """How many starts there are after the choice."""
+        return min(self.kept, self.starts) if self.tried else 1
+
+    @property
     def total(self) -> int:
-        kept = min(self.kept, self.starts) if self.tried else 1
-        return self.tried * self.starts + (self.iterations - self.tried) * kept + (kept > 1)
+        """Steps; where several starts go on, the best one's last is given again."""
+        return self.tried * self.starts + (self.iterations - self.tried) * self.going_on + (self.going_on > 1)
+
+    def __str__(self) -> str:
+        tried = f", after {self.tried} of each of {self.starts}" if self.going_on < self.starts else ""
+        return f"{self.iterations} of {self.going_on} {'start' if self.going_on == 1 else 'starts'}{tried}"
 
 
 @dataclass(frozen=True)

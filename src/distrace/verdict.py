@@ -13,8 +13,9 @@ MOST = 0.1  # a depth that is off by more is as wrong as one that is missed, and
 def contradiction(sdf: SDF, seen: Seen, config: TraceConfig) -> float:
     """How far a surface is from the depths, in the mean; and, × `MOST`, the share of rays that it meets wrongly.
 
-    The share is of those that meet it or the object: one less their intersection over union. A fit's own loss tells this worse: it takes a distance from the slope of the field, which grows without bounds where
-    rays graze the surface, and a single ray that misses a wing outweighs a hundred others.
+    The share is of those that meet it or the object: one less their intersection over union. A fit's own loss tells
+    worse which fit is good: it takes distances from the slope of the field, which are too large where rays graze the
+    surface, and a single ray that misses a wing outweighs a hundred others.
     """
     trace = sphere_trace(sdf, seen.rays, seen.bounds, config)
     deviation = (trace.distance - seen.observed).abs().clamp_max(MOST).masked_fill(~trace.hit, MOST)

@@ -117,7 +117,9 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
     known, full, truth, last = task.shown(task.known), task.shown(task.full), task.truth, outcome.steps[-1]
     losses: dict[str, list[float]] = {}
     for step in outcome.steps:
-        losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
+        curve = losses.setdefault(f"start {step.start + 1}", [])
+        if step.iteration > len(curve):  # else it is the result, given again
+            curve.append(step.loss)
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, last.code)
         camera = task.camera.to(task.mesh.device)
@@ -126,7 +128,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
     facts = {
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
-        "iterations": f"{task.fit.iterations}, after {task.fit.tried} of each of {task.fit.starts} starts",
+        "iterations": str(task.fit),
         "evaluations of the network": f"{outcome.evaluations:,}",
         "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
         "seed": str(task.fit.seed),
