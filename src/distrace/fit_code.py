@@ -38,7 +38,7 @@ class CodeFitConfig(Starts):
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
-    first_share: float = 0.3  # of them, in the first stage: while all is coarse, and starts compete
+    first_share: float = 0.3  # of them, in the first stage: while all is coarse
     compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.42  # … and × this from one stage to the next
