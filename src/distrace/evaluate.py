@@ -26,9 +26,7 @@ from distrace.shading import Picture, grid
 
 OBSERVATION_SIZE = 256
 TOLD = 20_000  # distances that a held-out shape is told by
-TOLD_FIT = CodeFitConfig(
-    iterations=40, starts=24, trial=6, kept=5, robust=0, compared=Comparison(Weights(code=1e-4))
-)  # with many starts: the loss of so many distances tells which end is best
+TOLD_FIT = CodeFitConfig(iterations=40, kept=1, robust=0, compared=Comparison(Weights(code=1e-4)))
 
 
 @dataclass(frozen=True)
