@@ -209,13 +209,13 @@ def test_a_view_whose_camera_is_turned_is_named() -> None:
 def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
     above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
-    *_, last = overlaps(seen_by(torus(0.5, 0.15), [*around, above]))
+    *others, view = seen_by(torus(0.5, 0.15), [*around, above])
+    *_, last = overlaps([*others, view])
     assert last.iou < 0.85, "the hull of the others has no hole"
     assert not last.doubtful
     aside = above.T_world_camera.clone()
     aside[0, 3] += 0.5
-    *others, wrong = seen_by(torus(0.5, 0.15), [*around, above])
-    wrong = replace(wrong, camera=replace(above, T_world_camera=aside))
+    wrong = replace(view, camera=replace(above, T_world_camera=aside))
     assert overlaps([*others, wrong])[-1].doubtful, "it rules out a part that others show"
 
 

@@ -51,7 +51,7 @@ class CodeFitConfig(Starts):
         if self.stages < 1:
             raise ValueError(f"{self.stages} stages were asked for; there must be at least 1")
 
-    def judging(self, stage: int) -> tuple[float, Kernel]:
+    def scale_and_kernel(self, stage: int) -> tuple[float, Kernel]:
         """A stage's scale, and how what is beyond it counts."""
         if stage >= self.stages - self.robust:
             return self.outlying, cauchy
@@ -79,9 +79,10 @@ def fit_code(
         some = seen(random, config.depth_rays, round(config.mask_rays * share))
         return Problem(decoder, prior, some, config.compared)
 
+    others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
+
     def judge(step: Step) -> Step:
         began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
-        others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
         loss = contradiction(sdf, others, config.compared.trace)
         return replace(step, loss=loss, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
@@ -141,7 +142,7 @@ def _solved(
     for stage, length in enumerate(config.stage_lengths):
         if stage < 2:
             problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
-        problem.scale, kernel = config.judging(stage)
+        problem.scale, kernel = config.scale_and_kernel(stage)
         state = problem.look(w, state)
         solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
         for solution in minimise(problem.residuals, state, problem.moved, solver):

@@ -52,29 +52,23 @@ def overlaps(photographs: Sequence[Photograph]) -> list[Overlap]:
     limit = max(NOTICEABLE, FAR_OFF * median(1 - iou for iou in found))
 
     def doubtful(number: int) -> bool:
+        """Not if its mask alone rules out what hardly another sees: then nothing lacks it.
+
+        A wrong camera takes away what others show.
+        """
         if 1 - found[number] <= limit:
             return False
-        own, *others = _with_own(photographs[number], views, number, places, solid)
-        before = mean(iou for each, iou in enumerate(found) if each != number)
-        return 1 - own > limit or mean(others) < before - MISSED
+        inside, on_object = looked_up(photographs[number].camera, photographs[number].known_mask, places)
+        again = _ious(solid & ~(inside & ~on_object), views)
+        lost = [before - after for each, (before, after) in enumerate(zip(found, again)) if each != number]
+        return 1 - again[number] > limit or mean(lost) > MISSED
 
     return [Overlap(each.name, found[number], doubtful(number)) for number, each in enumerate(photographs)]
 
 
-def _with_own(
-    photograph: Photograph, views: Sequence[Photograph], number: int, places: Tensor, solid: Tensor
-) -> list[float]:
-    """The overlap of one view, and of all others, where its mask alone may rule places out.
-
-    That may be what hardly another sees, and then nothing else lacks it; a wrong camera takes away what others show.
-    """
-    inside, on_object = looked_up(photograph.camera, photograph.known_mask, places)
-    return _ious(solid & ~(inside & ~on_object), [views[number], *views[:number], *views[number + 1 :]])
-
-
 def _ious(solid: Bool[Tensor, "places"], views: Sequence[Photograph]) -> list[float]:
     """Of each view's mask and of what its camera sees of a solid."""
-    hull, found = _distances(solid.reshape(CELLS, CELLS, CELLS)), []
+    hull, found = _distances(solid), []
     for each in views:
         rays = each.camera.rays()
         found.append(iou(sphere_trace(hull, rays, meet_sphere(rays), MARCH).hit, each.known_mask))
@@ -86,7 +80,7 @@ def visual_hull(photographs: Sequence[Photograph]) -> SDF:
 
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
-    return _distances(_allowed(photographs, WRONG)[1].reshape(CELLS, CELLS, CELLS))
+    return _distances(_allowed(photographs, WRONG)[1])
 
 
 def _allowed(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> tuple[Tensor, Tensor]:
@@ -116,11 +110,11 @@ def allowed(
     return places, enough & (left_out <= (wrong * seen).clamp_min(least)) & (places.norm(dim=-1) < 1)
 
 
-def _distances(solid: Bool[Tensor, "n n n"]) -> SDF:
-    """Between the middles of the cells linearly."""
-    cells = solid.shape[0]
+def _distances(solid: Bool[Tensor, "places"]) -> SDF:
+    """Between the middles of the finest grid's cells linearly."""
+    solid = solid.reshape(CELLS, CELLS, CELLS)
     outside, within = (torch.from_numpy(distance_transform_edt(part.numpy())).float() for part in (~solid, solid))
-    grid = ((outside - within) * 2 / cells)[None, None]
+    grid = ((outside - within) * 2 / CELLS)[None, None]
 
     def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         at = points.reshape(1, 1, 1, -1, 3).flip(-1).cpu()  # grid_sample's x is the last axis

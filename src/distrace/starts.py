@@ -65,7 +65,7 @@ Judge = Callable[[Stepped], Stepped]
 
 
 def unjudged(step: Stepped) -> Stepped:
-    """Its own loss tells."""
+    """Its own loss tells, and costs nothing."""
     return replace(step, seconds=0.0, evaluations=0)
 
 
@@ -87,16 +87,18 @@ def best_of(
             yield step
             tried[-1].append(step)
     order = sorted(range(len(tried)), key=lambda start: _mean_loss(tried[start][-recent:]))[: starts.kept]
-    ends, latest = {start: tried[start][-1] for start in order}, tried[-1][-1]
-    for start in order:
-        for latest in runs[start]:
-            yield latest
-            ends[start] = latest
-    verdicts = [(judge if len(ends) > 1 else unjudged)(end) for end in ends.values()]
-    best = min(zip(verdicts, ends.values(), strict=True), key=lambda pair: pair[0].loss)[1]
-    if len(ends) > 1 or best is not latest:
-        seconds, evaluations = sum(v.seconds for v in verdicts), sum(v.evaluations for v in verdicts)
-        yield replace(best, seconds=seconds, evaluations=evaluations)
+    if len(order) == 1:
+        yield next(runs[order[0]], None) or unjudged(tried[order[0]][-1])  # it may have settled
+        yield from runs[order[0]]
+        return
+    ends = [tried[start][-1] for start in order]
+    for k, start in enumerate(order):
+        for ends[k] in runs[start]:
+            yield ends[k]
+    verdicts = [judge(end) for end in ends]
+    best = min(range(len(ends)), key=lambda k: verdicts[k].loss)
+    seconds, evaluations = sum(v.seconds for v in verdicts), sum(v.evaluations for v in verdicts)
+    yield replace(ends[best], seconds=seconds, evaluations=evaluations)
 
 
 def _mean_loss(steps: Sequence[Step]) -> float:

@@ -4,6 +4,7 @@ import torch
 
 from distrace.code_residuals import Seen
 from distrace.field import SDF
+from distrace.metrics import iou
 from distrace.trace import TraceConfig, sphere_trace
 
 MOST = 0.1  # a depth that is off by more is as wrong as one that is missed, and so is a ray of the silhouette
@@ -19,6 +20,5 @@ def contradiction(sdf: SDF, seen: Seen, config: TraceConfig) -> float:
     """
     trace = sphere_trace(sdf, seen.rays, seen.bounds, config)
     deviation = (trace.distance - seen.observed).abs().clamp_max(MOST).masked_fill(~trace.hit, MOST)
-    either, both = trace.hit | seen.is_object, trace.hit & seen.is_object
     depth = deviation[seen.known].sum() / max(int(seen.known.sum()), 1)
-    return float(depth + MOST * (1 - both.sum() / max(int(either.sum()), 1)))
+    return float(depth) + MOST * (1 - iou(trace.hit, seen.is_object))
