@@ -79,6 +79,7 @@ ORDER = [
         "tables",
         "report",
         "views_page",
+        "clip_page",
         "reconstruction_page",
         "depth_tables",
         "card",

@@ -15,11 +15,23 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoint import Model, save_model
 from distrace.cli import main
+from distrace.clip_page import LIMIT, comparison, save_clip_page
 from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
+from distrace.data.solid import Solid
 from distrace.fit_photos import PhotoConfig
-from distrace.multiview_table import ClipResult, disturbed, left_over, multiview_rows, settings_of
+from distrace.multiview_table import (
+    ClipResult,
+    ClipTrial,
+    clip_done,
+    disturbed,
+    left_over,
+    multiview_rows,
+    settings_of,
+    surface_of,
+)
 from distrace.pose import Similarity
 from distrace.render import render
+from distrace.shading import error_picture
 
 
 @pytest.fixture
@@ -106,6 +118,54 @@ def test_rows_are_medians_of_each_class_background_and_method() -> None:
     assert [(row["method"], row["chamfer"], row["n"]) for row in found] == [("ours", 6, 2), ("ours, moved", 3, 2)]
     assert found[1]["recovered"] == 0.5
     assert "recovered" not in found[0]
+
+
+def test_a_clips_page_draws_meshes_and_points_and_their_distances_from_the_truth() -> None:
+    frames = [Photograph(f"{k:02}", camera, torch.full((40, 40, 3), 0.5)) for k, camera in enumerate(ring(6, 40))]
+    ball, larger = (trimesh.creation.icosphere(subdivisions=3, radius=radius) for radius in (0.5, 0.5 + LIMIT / 2))
+    surfaces = {"ours": ball, "large": larger, "stereo": np.asarray(ball.vertices)}
+    picture = comparison(frames, surfaces, Solid(ball, ball))
+    cell = 48  # 40 pixels and a gap
+    assert picture.shape == (4 * cell - 8, 4 * cell - 8, 3), "two eyes; shapes and distances; the truth and three"
+    middles = picture[20::cell, 20::cell]
+    assert (middles[1, 0] == 255).all(), "nothing below the truth"
+    right, half = (error_picture(np.array([[apart]]), LIMIT)[0, 0] for apart in (0.0, LIMIT / 2))
+    np.testing.assert_allclose(middles[1, 1], right, atol=3)
+    np.testing.assert_allclose(middles[1, 2], half, atol=4)
+    assert (picture[:40, 3 * cell :] == 96).any(), "points are dots"
+
+
+def test_a_trial_leaves_its_surface_and_is_done_again_without_it(
+    tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stereo leaves points; and the page shows what was found."""
+    clip = {"split": "s.csv", "shape": "ball", "background": "plain", "texture": "own"}
+    clip |= {"seed": 0, "frames": 6, "size": 40, "samples": 1}
+    save_views(tmp_path / "clip", ring(6, 40))
+    (tmp_path / "clip" / "clip.json").write_text(json.dumps(clip))
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
+    calls: list[str] = []
+
+    def found(views: object) -> np.ndarray:
+        calls.append("stereo")
+        return np.asarray(ball.vertices) * 1.05
+
+    for module in ("multiview_table", "clip_page"):
+        monkeypatch.setattr(f"distrace.{module}.true_solid", lambda *given: Solid(ball, ball))
+    monkeypatch.setattr("distrace.multiview_table.stereo_points", found)
+    trial = ClipTrial(tmp_path / "clip", "stereo", tmp_path, tmp_path / "out", str(model))
+    result = clip_done(trial)
+    assert clip_done(trial) == result
+    assert len(calls) == 1
+    np.testing.assert_allclose(surface_of(trial), np.asarray(ball.vertices) * 1.05, atol=1e-5)
+    save_clip_page(tmp_path / "pages", tmp_path / "clip", [trial], tmp_path)
+    assert {path.name for path in (tmp_path / "pages").iterdir()} == {"ball_plain.html", "ball_plain.png"}
+    page = (tmp_path / "pages" / "ball_plain.html").read_text()
+    assert "<h1>ball from a clip</h1>" in page
+    assert page.count("<img") == 6 + 1, "frames, and the comparison"
+    trial.file(".ply").unlink()
+    clip_done(trial)
+    assert len(calls) == 2
 
 
 def test_unknown_methods_are_refused() -> None:

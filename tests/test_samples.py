@@ -12,7 +12,7 @@ import trimesh
 
 from distrace import primitives
 from distrace.data import sampling
-from distrace.data.samples import Doubt, sample, write_samples
+from distrace.data.samples import Doubt, doubt, lost, sample, write_samples
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid
 from distrace.data.split import Shape, every_mesh, read_split
 from distrace.train import load_samples
@@ -100,6 +100,33 @@ def test_a_file_of_samples_holds_the_outside_and_the_inside_apart(of_cube: np.nd
     loaded = load_samples([tmp_path / "cube.npz"])
     np.testing.assert_array_equal(loaded.inside[0].numpy(), neg)
     np.testing.assert_array_equal(loaded.outside[0].numpy(), pos)
+
+
+def canopy(width: float) -> trimesh.Trimesh:
+    """A block with a sheet without thickness over it, drawn from both sides as cloth often is."""
+    faces = [[0, 1, 2], [0, 2, 3], [2, 1, 0], [3, 2, 0]]
+    sheet = trimesh.Trimesh([[-1, 1, -1], [1, 1, -1], [1, 1, 1], [-1, 1, 1]], faces, process=False)
+    sheet.apply_scale((width, 1, width))
+    return trimesh.util.concatenate([trimesh.creation.box((2, 1, 2)), sheet])
+
+
+def test_what_is_seen_and_bounds_no_solid_is_measured(tmp_path: Path) -> None:
+    """Rays that cross a convex body are as many as it has surface: Cauchy's theorem tells the share of a far sheet."""
+    assert lost(cube()) == 0
+    area = {"sheet": 2 * 4.0, "block": 16.0}  # a sheet is seen from both sides
+    canopy(1.0).export(tmp_path / "canopy.ply")
+    report = doubt("canopy", load_solid(tmp_path / "canopy.ply"))
+    least, most = area["sheet"] / sum(area.values()) * 0.8, area["sheet"] / area["block"]
+    assert least < report.lost < most, "some rays meet both, and the sheet first or the block"
+    assert report.doubtful < 0.02
+
+
+def test_a_mesh_that_is_mostly_sheets_is_left_out_with_the_reason(tmp_path: Path) -> None:
+    canopy(3.0).export(tmp_path / "canopy.ply")
+    report = doubt("canopy", load_solid(tmp_path / "canopy.ply"))
+    assert not report.usable
+    assert report.reason == f"{report.lost:.0%} of what is seen of it bounds no solid"
+    assert report.lost > 0.7
 
 
 # ---- sampling a folder: one run, with one worker, for all that follows

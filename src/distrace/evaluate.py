@@ -25,8 +25,9 @@ from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 
 OBSERVATION_SIZE = 256
-TOLD = 20_000  # distances that a held-out shape is told by
-TOLD_FIT = CodeFitConfig(iterations=40, kept=1, robust=0, compared=Comparison(Weights(code=1e-4)))
+TOLD = 40_000  # distances that a held-out shape is told by, …
+TOLD_NEAR = 0.5  # … and how many of them are near the surface: the others tell where nothing is
+TOLD_FIT = CodeFitConfig(iterations=40, robust=0, compared=Comparison(Weights(code=1e-4)))
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution
 
 def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
     """A solid as the model says it best."""
-    samples = torch.from_numpy(sample(solid, TOLD, seed=0))
+    samples = torch.from_numpy(sample(solid, TOLD, seed=0, near=TOLD_NEAR))
     steps = list(fit_points(model.decoder, samples, prior_of(model.codes), TOLD_FIT))
     seconds = sum(step.seconds for step in steps)
     return compared(name, "all distances", 0, model, steps[-1].code, solid.surface, seconds, resolution)

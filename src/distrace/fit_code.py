@@ -12,15 +12,15 @@ from torch import Tensor
 
 from distrace.code_residuals import Comparison, Problem, Seen
 from distrace.data.view import View
-from distrace.decoder import Decoder
-from distrace.field import Counted
+from distrace.decoder import FAR, Decoder
+from distrace.field import SDF, Counted
 from distrace.fit import pools_of
 from distrace.losses import Weights
 from distrace.nearest import DEPTHS, SILHOUETTE, Hints, first_of
-from distrace.point_residuals import PointProblem
+from distrace.point_residuals import LOOKED, PointProblem, drawn, misfit
 from distrace.prior import Prior
 from distrace.solver import Kernel, SolverConfig, cauchy, charbonnier, minimise
-from distrace.starts import Judge, Starts, Step, best_of, unjudged
+from distrace.starts import Starts, Step, best_of
 from distrace.verdict import contradiction
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
@@ -81,13 +81,11 @@ def fit_code(
 
     others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
 
-    def judge(step: Step) -> Step:
-        began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
-        loss = contradiction(sdf, others, config.compared.trace)
-        return replace(step, loss=loss, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
+    def verdict(sdf: SDF, step: Step) -> float:
+        return contradiction(sdf, others, config.compared.trace)
 
     random = torch.Generator().manual_seed(config.seed)
-    return _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, judge)
+    return _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
 
 
 def fit_points(
@@ -95,20 +93,26 @@ def fit_points(
 ) -> Iterator[Step]:
     """Fits a code to points and their signed distances, which are 0 on the surface, as `fit_code` does to views.
 
+    The end that is nearest to all of them is the last step again. A list of distances should tell where nothing is,
+    too: points far from the surface are compared only where a fit has come too near to them.
+
     Raises `ValueError` without points.
     """
     if not len(samples):
         raise ValueError("no points were given; fitting needs points with their signed distances")
 
     def problem(random: torch.Generator, share: float) -> PointProblem:
-        chosen = samples[
-            torch.randperm(len(samples), generator=random)[: config.depth_rays + round(config.mask_rays * share)]
-        ]
-        return PointProblem(decoder, prior, chosen, config.compared.weights)
+        count = config.depth_rays + round(config.mask_rays * share)
+        return PointProblem(decoder, prior, samples, count, random, weights)
 
-    random = torch.Generator().manual_seed(config.seed)
-    some = samples[torch.randperm(len(samples), generator=random)[: DEPTHS + SILHOUETTE]]
-    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config)
+    def verdict(sdf: SDF, step: Step) -> float:
+        return weights.depth * misfit(sdf, others) + step.terms["code"]
+
+    random, weights = torch.Generator().manual_seed(config.seed), config.compared.weights
+    near = samples[samples[:, 3].abs() < FAR]
+    some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
+    others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
+    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config, verdict)
 
 
 def _best(
@@ -117,13 +121,17 @@ def _best(
     hints: Hints,
     problem_of: ProblemOf,
     config: CodeFitConfig,
-    judge: Judge[Step] = unjudged,
+    verdict: Callable[[SDF, Step], float],
 ) -> Iterator[Step]:
-    """From all starts; the first step is charged with the search for them."""
+    """From all starts; the first step is charged with the search for them. The least verdict's end is the best."""
     first = first_of(decoder, prior, hints, config.starts, config.seed)
 
     def run(start: int) -> Iterator[Step]:
         return _solved(problem_of, prior, config, start, first.coordinates[start])
+
+    def judge(step: Step) -> Step:
+        began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
+        return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
     steps = best_of(config, run, judge, recent=1)
     step = next(steps)

@@ -24,7 +24,7 @@ from distrace.data.photographs import Photograph, load_photographs
 from distrace.data.pictures import read_mask
 from distrace.data.view import View
 from distrace.errors import explained
-from distrace.files import save_json
+from distrace.files import save_json, written
 from distrace.fit_code import CodeFitConfig, fit_code
 from distrace.fit_photos import PhotoConfig, fit_photos, ranked
 from distrace.mesh import MeshConfig, extract_mesh
@@ -43,6 +43,8 @@ RECOVERED = (2.0, 0.02, 0.02)  # a fifth of that: to so much, the place counts a
 REGISTERED = 10_000  # points of each surface, for what a registration would still move
 RESOLUTION = 192
 
+Surface = trimesh.Trimesh | np.ndarray  # or points of it
+
 
 @dataclass(frozen=True)
 class ClipTrial:
@@ -53,6 +55,11 @@ class ClipTrial:
     meshes: Path
     out: Path
     model: str | None = None  # by default that of the clip's split
+
+    def file(self, suffix: str) -> Path:
+        """What the trial leaves: its figures (.json), and its surface (.ply)."""
+        clip = described(self.folder)
+        return self.out / "trials" / f"{clip['shape']}_{clip['background']}_{self.method}{suffix}"
 
 
 @dataclass(frozen=True)
@@ -90,14 +97,13 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     clip = described(trial.folder)
     model = opened_once(trial.model or clip["split"])
     mark = fingerprint(model, clip["seed"], clip["frames"], clip["size"], clip["samples"], settings_of(trial.method))
-    path = trial.out / "trials" / f"{clip['shape']}_{clip['background']}_{trial.method}.json"
-    if path.is_file():
-        kept = read_json(path)
+    if trial.file(".json").is_file() and trial.file(".ply").is_file():
+        kept = read_json(trial.file(".json"))
         if kept.pop("made_by", None) == mark:
             return ClipResult(**kept)
     began, code = time.perf_counter(), torch.zeros(0)
     if trial.method == "stereo":
-        surface: trimesh.Trimesh | np.ndarray = stereo_points(load_photographs(trial.folder).views)
+        surface: Surface = stereo_points(load_photographs(trial.folder).views)
         seconds = time.perf_counter() - began
     else:
         code, place = _found(trial, model, clip)
@@ -108,11 +114,19 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     distance, off = chamfer(surface, true), left_over(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
     result = ClipResult(*names, distance.to, distance.from_, seconds, *off, [round(x, 6) for x in code.tolist()])
-    save_json(path, {"made_by": mark, **asdict(result)})
+    with written(trial.file(".ply")) as file:
+        (trimesh.PointCloud(surface) if isinstance(surface, np.ndarray) else surface).export(file, file_type="ply")
+    save_json(trial.file(".json"), {"made_by": mark, **asdict(result)})
     return result
 
 
-def left_over(surface: trimesh.Trimesh | np.ndarray, true: trimesh.Trimesh) -> tuple[float, float, float]:
+def surface_of(trial: ClipTrial) -> Surface:
+    """What a trial that is done has found."""
+    found: Any = trimesh.load(trial.file(".ply"), process=False)
+    return found if isinstance(found, trimesh.Trimesh) else np.asarray(found.vertices)
+
+
+def left_over(surface: Surface, true: trimesh.Trimesh) -> tuple[float, float, float]:
     """What a similarity by iterative closest points still moves a surface by: degrees, radii, and part of its size.
 
     A code can make a shape larger and the place smaller: neither is right or wrong alone.

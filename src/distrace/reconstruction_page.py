@@ -23,7 +23,7 @@ from distrace.reconstruct import Reconstruction
 from distrace.reconstruction_terms import coloured
 from distrace.render import Buffers, render
 from distrace.scene import scene
-from distrace.shading import Picture, mask_comparison, normal_picture, side_by_side
+from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 
 FINER = 2  # rays across a pixel: photographs have means over areas
 
@@ -49,8 +49,8 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
     mask, image = view.known_mask, view.image
     error = (made - image)[mask].square().mean().clamp_min(1e-10)
     pictures = [
-        _picture(torch.where(mask[..., None], image, 0.4 * image)),
-        _picture(torch.where(hit[..., None], made, 1.0)),
+        colour_picture(torch.where(mask[..., None], image, 0.4 * image)),
+        colour_picture(torch.where(hit[..., None], made, 1.0)),
         normal_picture(buffers.normal[::FINER, ::FINER], buffers.mask[::FINER, ::FINER], view.camera.T_world_camera),
         mask_comparison(mask, hit),
     ]
@@ -126,7 +126,3 @@ def reconstruction_page(
 
 def _shown(view: Judged) -> Html:
     return figure(view.picture, f"{view.name}: {view.psnr:.1f} dB, intersection over union {view.silhouette_iou:.3f}")
-
-
-def _picture(image: torch.Tensor) -> Picture:
-    return (255 * image.clamp(0, 1)).round().to(torch.uint8).numpy()

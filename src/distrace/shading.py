@@ -54,6 +54,11 @@ def normal_picture(
     return _over_white((_numpy(normal) @ axes + 1) / 2, _numpy(mask))
 
 
+def colour_picture(image: Float[Array, "height width 3"]) -> Picture:
+    """Red, green and blue from 0 to 1."""
+    return np.rint(255 * np.clip(_numpy(image), 0, 1)).astype(np.uint8)
+
+
 def mask_picture(mask: Bool[Array, "height width"]) -> Picture:
     seen = _numpy(mask)
     return np.where(seen[..., None], INK, WHITE).astype(np.uint8)
@@ -145,7 +150,7 @@ def _unit(vector: np.ndarray) -> np.ndarray:
 
 def _over_white(colours: Float[np.ndarray, "height width 3"], seen: Bool[np.ndarray, "height width"]) -> Picture:
     """Colours from 0 to 1 where something was seen, white elsewhere."""
-    return np.rint(255 * np.where(seen[..., None], np.clip(colours, 0, 1), 1)).astype(np.uint8)
+    return colour_picture(np.where(seen[..., None], colours, 1))
 
 
 def _numpy(image: Array) -> np.ndarray:

@@ -17,7 +17,7 @@ from distrace.page import figure, page, paragraph, row, section, table
 from distrace.render import Buffers, render
 from distrace.report import View
 from distrace.scene import scene
-from distrace.shading import EXTRA, Picture, side_by_side
+from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
 from distrace.targets import band
 
 SHOWN = 8  # views
@@ -66,7 +66,7 @@ def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
     """The photograph with the outline of the shape, and the shape."""
     small = view.at_most(SIZE)
     buffers = _rendered(model, step, view.camera)
-    picture = (small.image * 255).round().to(torch.uint8).numpy()
+    picture = colour_picture(small.image)
     picture[band(buffers.mask, 3).numpy()] = EXTRA
     return side_by_side([picture, View.of(buffers).shaded])
 

@@ -11,6 +11,7 @@ import tyro
 from distrace import depth_tables
 from distrace.cli.common import Meshes, show_table
 from distrace.cli.console import console, origin, progress, start
+from distrace.clip_page import save_clip_page
 from distrace.data.split import CLASSES
 from distrace.files import save_text
 from distrace.focal_test import look_rows, looks
@@ -123,7 +124,10 @@ class Spread:
 
 @dataclass(frozen=True)
 class Multiview:
-    """Held-out shapes from clips: ours, masks alone, the nearest training shape, stereo. A second run goes on."""
+    """Held-out shapes from clips: ours, masks alone, the nearest training shape, stereo. A second run goes on.
+
+    Each clip has a page with its frames, what each method found, and how far that is from the truth.
+    """
 
     clips: tyro.conf.Positional[tuple[Path, ...]]  # folders as `distrace clip` makes them
     methods: tuple[str, ...] = METHODS_OF_CLIPS
@@ -139,14 +143,18 @@ class Multiview:
         for folder in self.clips:
             described(folder)
         run, results = start(self.out), []
-        trials = [
-            ClipTrial(clip, method, self.meshes, run.out, self.model) for clip in self.clips for method in self.methods
-        ]
+        of_clip = {
+            clip: [ClipTrial(clip, method, self.meshes, run.out, self.model) for method in self.methods]
+            for clip in self.clips
+        }
+        trials = [trial for some in of_clip.values() for trial in some]
         with progress("multiview", len(trials)) as bar:
             for each in each_done(clip_done, trials, self.jobs):
                 results.append(each)
                 bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
         results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))
+        for clip, some in of_clip.items():
+            save_clip_page(run.out / "pages", clip, some, self.meshes)
         rows = multiview_rows(results)
         show_table([{key: row.get(key, "") for key in rows[-1] | rows[0]} for row in rows])
         run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})

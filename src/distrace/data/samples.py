@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from distrace.data.solid import Solid
+from distrace.data.solid import Solid, first_met
 from distrace.files import written
 from distrace.metrics import surface_points
 
@@ -15,6 +15,8 @@ NEAR = 0.94  # the share of samples near the surface; the rest fills the unit sp
 VARIANCES = (0.0025, 0.00025, 0.000025)  # DeepSDF has the first two; the third is for thin legs and wings
 DOUBTFUL = 0.25  # a winding number this far from a whole number leaves the sign in doubt
 HOPELESS = 0.02  # a shape with a larger share of doubtful signs is not learnt
+HOLLOW = 0.3  # nor one of which a larger share of what is seen bounds no solid: cloth and cane drawn without thickness
+BEHIND = 0.02  # what is seen of the solid, if so far behind what is seen of the mesh, is something else
 
 
 @dataclass(frozen=True)
@@ -27,17 +29,15 @@ class Doubt:
     doubtful: float  # share of samples whose winding number is far from a whole number
     usable: bool
     reason: str = ""  # why it is left out
+    lost: float = 0.0  # share of what is seen of the mesh that bounds no solid
 
 
-def sample(solid: Solid, count: int, seed: int) -> Float[np.ndarray, "count 4"]:
+def sample(solid: Solid, count: int, seed: int, near: float = NEAR) -> Float[np.ndarray, "count 4"]:
     """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""
     random = np.random.default_rng(seed)
-    near = int(NEAR * count) // len(VARIANCES)
-    surface = surface_points(solid.surface, near, seed)
+    surface = surface_points(solid.surface, int(near * count) // len(VARIANCES), seed)
     displaced = np.concatenate([surface + random.normal(size=surface.shape) * variance**0.5 for variance in VARIANCES])
-    direction = random.normal(size=(count - len(displaced), 3))
-    radius = random.random((len(direction), 1)) ** (1 / 3)
-    points = np.concatenate([displaced, direction / np.linalg.norm(direction, axis=1, keepdims=True) * radius])
+    points = np.concatenate([displaced, _in_ball(random, count - len(displaced))])
     return np.column_stack([points, solid.distance(points)]).astype(np.float32)
 
 
@@ -46,10 +46,27 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * np.abs(solid.soup.bounds).max(0) * 1.05
     winding = solid.winding(points)
     doubtful = float((np.abs(winding - np.round(winding)) > DOUBTFUL).mean())
-    outer = float(solid.surface.area / solid.soup.area)
-    usable = doubtful <= HOPELESS
-    reason = "" if usable else f"{doubtful:.1%} of its signs are doubtful"
-    return Doubt(name, len(solid.soup.faces), outer, doubtful, usable, reason)
+    outer, missing = float(solid.surface.area / solid.soup.area), lost(solid)
+    reasons = [f"{doubtful:.1%} of its signs are doubtful"] if doubtful > HOPELESS else []
+    reasons += [f"{missing:.0%} of what is seen of it bounds no solid"] if missing > HOLLOW else []
+    return Doubt(name, len(solid.soup.faces), outer, doubtful, not reasons, " and ".join(reasons), missing)
+
+
+def lost(solid: Solid, count: int = 5000) -> float:
+    """Of random rays that meet the mesh, the share that do not meet the solid there: a chair's seat of cane, say."""
+    random = np.random.default_rng(0)
+    directions = random.normal(size=(count, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    origins = _in_ball(random, count) - 2 * directions
+    of_soup, of_solid = (first_met(mesh, origins, directions) for mesh in (solid.soup, solid.surface))
+    met = np.isfinite(of_soup)
+    return float((of_solid[met] > of_soup[met] + BEHIND).mean()) if met.any() else 0.0
+
+
+def _in_ball(random: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:
+    """Points that fill the unit sphere evenly."""
+    direction = random.normal(size=(count, 3))
+    return direction * random.random((count, 1)) ** (1 / 3) / np.linalg.norm(direction, axis=1, keepdims=True)
 
 
 def write_samples(path: Path, samples: Float[np.ndarray, "n 4"]) -> None:

@@ -107,6 +107,17 @@ def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
     return middle, RADIUS / np.linalg.norm(used - middle, axis=1).max()
 
 
+def first_met(
+    mesh: trimesh.Trimesh, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n"]:
+    """How far along each ray the mesh is met, by Embree; `inf` where it is not."""
+    cast: Any = mesh.ray.intersects_location
+    points, rays, _ = cast(origins, directions, multiple_hits=False)
+    distance = np.full(len(origins), np.inf)
+    distance[rays] = np.linalg.norm(points - origins[rays], axis=1)
+    return distance
+
+
 def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
     """The faces that have the solid on exactly one side, turned outwards; faces half buried are split first."""
     kept, triangles = [], soup.triangles.view(np.ndarray)
