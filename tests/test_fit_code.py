@@ -10,10 +10,11 @@ from bumpy import bumpy_balls
 from distrace.camera import Camera
 from distrace.code_residuals import Comparison, Problem, Seen, derivatives
 from distrace.data.view import View
-from distrace.decoder import Decoder
-from distrace.fit_code import CodeFitConfig, fit_code
+from distrace.decoder import FAR, Decoder
+from distrace.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.losses import Weights
 from distrace.nearest import Hints, first_of
+from distrace.point_residuals import PointProblem, misfit
 from distrace.prior import Prior
 from distrace.render import render
 from distrace.solver import SolverConfig, minimise
@@ -245,3 +246,39 @@ def test_points_before_and_beside_a_surface_are_free(decoder: Decoder, view: Vie
     assert float(values[free].min()) > -0.01
     assert float(values[~free].abs().max()) < 0.01
     assert float((hints.points - CAMERA.T_world_camera[:3, 3]).norm(dim=1).max()) < 3.6
+
+
+# ---- to points
+
+
+def told(decoder: Decoder, count: int = 4000) -> torch.Tensor:
+    """Points in the unit sphere, and the distances of the true code's shape."""
+    points = torch.nn.functional.normalize(torch.randn(count, 3, generator=torch.Generator().manual_seed(3)), dim=-1)
+    points *= torch.rand(count, 1, generator=torch.Generator().manual_seed(4)) ** (1 / 3)
+    return torch.cat([points, decoder.field(TRUE)(points).detach()[:, None]], dim=1)
+
+
+def test_points_are_drawn_of_those_that_say_something(decoder: Decoder) -> None:
+    samples, random = told(decoder), torch.Generator().manual_seed(0)
+    problem = PointProblem(decoder, PRIOR, samples, 200, random, Weights(code=0.0))
+    looked = problem.look(torch.zeros(4)).samples
+    values, distances = decoder.field(PRIOR.mean)(looked[:, :3]), looked[:, 3]
+    right = (values.abs() > FAR) & (distances.abs() > FAR) & (values.sign() == distances.sign())
+    assert len(looked) == 200
+    assert not right.any()
+    everywhere = decoder.field(PRIOR.mean)(samples[:, :3])
+    assert ((everywhere.abs() > FAR) & (samples[:, 3].abs() > FAR)).float().mean() > 0.4, "most would say nothing"
+
+
+def test_a_misfit_is_a_mean_that_knows_no_distance_beyond_far(decoder: Decoder) -> None:
+    samples = told(decoder)
+    assert misfit(decoder.field(TRUE), samples) == pytest.approx(0, abs=1e-6)
+    assert misfit(lambda points: torch.full_like(points[:, 0], 5.0), torch.tensor([[0, 0, 0, 0.03]])) == pytest.approx(
+        FAR - 0.03
+    )
+
+
+def test_a_code_is_found_from_distances_all_around(decoder: Decoder, view: View) -> None:
+    steps = list(fit_points(decoder, told(decoder), PRIOR, replace(CONFIG, iterations=24)))
+    assert error(decoder, steps[-1].code) < 2e-3
+    assert error(decoder, steps[-1].code) < 0.05 * error(decoder, PRIOR.mean)
