@@ -46,7 +46,7 @@ def clip_page(folder: Path, results: Sequence[ClipResult], surfaces: Mapping[str
     colours = error_picture(np.linspace(0, LIMIT, 9)[None], LIMIT)
     return page(
         f"{first.shape} from a clip",
-        f"{first.category}, {first.background} background; cameras were known, neither depths nor masks.",
+        f"{first.category}, {first.background} background; cameras were known, neither depths nor masks (but for silhouettes).",
         [
             section("Frames", row(*(figure(colour_picture(view.image), view.name) for view in some))),
             section(
@@ -64,7 +64,7 @@ def clip_page(folder: Path, results: Sequence[ClipResult], surfaces: Mapping[str
 def comparison(frames: Sequence[Photograph], surfaces: Mapping[str, Surface], true: Solid) -> Picture:
     """From some frames' cameras: the true shape and those found, shaded; under each its distance from the truth."""
     lines: list[list[Picture]] = []
-    for frame in frames[:: -(-len(frames) // EYES)]:
+    for frame in frames[1 :: -(-len(frames) // EYES)]:  # the first would see the shape from straight ahead
         truth = _shaded(observe(true, frame.camera))
         seen = [_seen(surface, frame.camera) for surface in surfaces.values()]
         lines += [[truth, *map(_shaded, seen)], [np.full_like(truth, 255), *(_apart(view, true) for view in seen)]]
