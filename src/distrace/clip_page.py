@@ -46,7 +46,7 @@ def clip_page(folder: Path, results: Sequence[ClipResult], surfaces: Mapping[str
     colours = error_picture(np.linspace(0, LIMIT, 9)[None], LIMIT)
     return page(
         f"{first.shape} from a clip",
-        f"{first.category}, {first.background} background; cameras were known, neither depths nor masks (but for silhouettes).",
+        f"{first.category}, {first.background} background; cameras were known, and masks to silhouettes alone.",
         [
             section("Frames", row(*(figure(colour_picture(view.image), view.name) for view in some))),
             section(
