@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import igl
 import numpy as np
 import torch
 import trimesh
@@ -33,13 +32,21 @@ def save_clip_page(out: Path, folder: Path, trials: Sequence[ClipTrial], meshes:
     true = true_solid(meshes, clip["split"], clip["shape"])
     surfaces = {trial.method: surface_of(trial) for trial in trials}
     name, results = f"{clip['shape']}_{clip['background']}", [clip_done(trial) for trial in trials]
-    save_png(out / f"{name}.png", comparison(_frames(folder), surfaces, true))
-    save_text(out / f"{name}.html", clip_page(folder, results, surfaces, true))
+    frames = _frames(folder)
+    picture = comparison(frames, surfaces, true)
+    save_png(out / f"{name}.png", picture)
+    save_text(out / f"{name}.html", clip_page(frames, picture, results, surfaces, true))
 
 
-def clip_page(folder: Path, results: Sequence[ClipResult], surfaces: Mapping[str, Surface], true: Solid) -> str:
+def clip_page(
+    frames: Sequence[Photograph],
+    picture: Picture,
+    results: Sequence[ClipResult],
+    surfaces: Mapping[str, Surface],
+    true: Solid,
+) -> str:
     """Frames, shapes and figures of one clip, and all surfaces to turn."""
-    some, first = _frames(folder), results[0]
+    first = results[0]
     meshes = {name: each for name, each in surfaces.items() if isinstance(each, trimesh.Trimesh)}
     clouds = {name: each for name, each in surfaces.items() if isinstance(each, np.ndarray)}
     rows = [[each.method, *map(short, (each.chamfer_to, each.chamfer_from, each.chamfer))] for each in results]
@@ -48,11 +55,11 @@ def clip_page(folder: Path, results: Sequence[ClipResult], surfaces: Mapping[str
         f"{first.shape} from a clip",
         f"{first.category}, {first.background} background; cameras were known, and masks to silhouettes alone.",
         [
-            section("Frames", row(*(figure(colour_picture(view.image), view.name) for view in some))),
+            section("Frames", row(*(figure(colour_picture(view.image), view.name) for view in frames))),
             section(
                 "Shapes",
                 paragraph(f"The true shape, then {', '.join(surfaces)}: below, how far each is from the true surface."),
-                figure(comparison(some, surfaces, true), "from two of the frames' cameras"),
+                figure(picture, "from two of the frames' cameras"),
                 ramp("on the surface", f"{LIMIT:g} radii away", colours),
             ),
             section("Chamfer distance × 1000", table(["method", "to the truth", "from the truth", "sum"], rows)),
@@ -91,9 +98,6 @@ def _shaded(view: View) -> Picture:
 
 def _apart(view: View, true: Solid) -> Picture:
     """How far what is seen is from the true surface."""
-    squared, _, _ = igl.point_mesh_squared_distance(
-        view.points().double().numpy(), np.asarray(true.surface.vertices), true.surface.faces.astype(np.int64)
-    )
     distance = np.full(view.depth.shape, np.nan)
-    distance[view.seen.numpy()] = np.sqrt(squared)
+    distance[view.seen.numpy()] = np.abs(true.distance(view.points().double().numpy()))
     return error_picture(distance, LIMIT)
