@@ -39,6 +39,16 @@ def test_what_is_thin_stays() -> None:
     assert found[60:66, 12:40].float().mean() > 0.9
 
 
+def test_a_niche_in_shadow_is_object_and_a_window_is_not() -> None:
+    truth = ball()
+    image = photographed(truth, 0.02)
+    image[70:78, 60:80] = image[0:8, 60:80]
+    image[84:92, 60:80] = image[0:8, 60:80] + torch.tensor([0.05, 0.04, 0.02])
+    (found,) = dark_masks([image])
+    assert found[86:90, 62:78].all(), "lighter than the background, though nearer to it than to the object"
+    assert not found[72:76, 62:78].any()
+
+
 def test_an_image_of_nothing_has_nothing_in_it() -> None:
     blank = torch.zeros(160, 160, 3)
     shown, empty = dark_masks([photographed(ball(), 0.02), blank])

@@ -21,7 +21,7 @@ def views() -> list[Photograph]:
 
 
 def found(views: list[Photograph]) -> Similarity:
-    return whereabouts(Stage.of(views, 1.0, COMPARED), bumpy_balls().field(TRUE), Similarity.identity())
+    return whereabouts(Stage.of(views, 1.0, COMPARED), [bumpy_balls().field(TRUE)], Similarity.identity())
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -37,7 +37,7 @@ class CodeFitConfig(Starts):
     kept: int = 3  # all: what a few iterations reach says little about the end
     stages: int = 4
     depth_rays: int = 1000  # of each view
-    mask_rays: int = 1500  # few would be fitted for themselves: a code has 256 coordinates
+    mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates
     first_share: float = 0.3  # of them, in the first stage: while all is coarse
     compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …

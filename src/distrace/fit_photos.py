@@ -25,7 +25,8 @@ from distrace.whereabouts import whereabouts
 SCREENED = 400  # rays on which all training shapes are compared, …
 COMPARED = 1000  # … and those on which the best of them are: one in so many, and no fewer than
 KEPT, FEWEST = 8, 8
-ASKED = 8  # training shapes, of which place is the likelier
+TYPICAL = 5  # training shapes, nearest to the mean, that say how large an object is
+ASKED = 8  # of them, of which place is the likelier
 
 
 @dataclass(frozen=True)
@@ -78,11 +79,12 @@ def fit_photos(
     stages = [Stage.of(photographs, level, config.compared) for level in config.levels]
     there = place or Similarity.identity()
     if config.compared.moves:
-        typical = min((prior.coordinates(code) for code in prior.codes), key=torch.norm, default=prior.start(0, 0))
-        told = whereabouts(stages[-1], decoder.field(prior.code(typical)), there)
+        typical = sorted((prior.coordinates(code) for code in prior.codes), key=torch.norm)[:TYPICAL]
+        shapes = [decoder.field(prior.code(w)) for w in typical or [prior.start(0, config.seed)]]
+        told = whereabouts(stages[-1], shapes, there)
         there = _likelier(decoder, stages[0], prior, config, (there, told))
-    shapes = [Shape(w, there) for w in _starts(decoder, stages[0], prior, config, there)]
-    return best_of(config, lambda start: _solved(decoder, stages, prior, config, start, shapes[start]), recent=1)
+    starts = [Shape(w, there) for w in _starts(decoder, stages[0], prior, config, there)]
+    return best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), recent=1)
 
 
 def _likelier(

@@ -5,7 +5,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-import igl
 import numpy as np
 import torch
 from scipy.stats import rankdata
@@ -51,15 +50,13 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
     mesh = extract_mesh(opened.field(steps[-1].code), MeshConfig())
     points = surface_points(mesh, LOOKED_AT, seed=0)
     apart = spread(opened, [step.code for step in others], torch.tensor(points, dtype=torch.float32)).numpy()
-    surface = truth.surface
-    squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces.astype(np.int64))
-    error, calm = np.sqrt(squared), apart < np.median(apart)
+    error, calm = np.abs(truth.distance(points)), apart < np.median(apart)
     return SpreadRow(
         category,
         name,
         float(np.corrcoef(rankdata(apart), rankdata(error))[0, 1]),
         float(error[calm].mean()),
         float(error[~calm].mean()),
-        chamfer(mesh, surface).sum,
+        chamfer(mesh, truth.surface).sum,
         sum(step.seconds for step in (*steps, *others)),
     )

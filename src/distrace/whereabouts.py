@@ -17,19 +17,24 @@ from distrace.render import render
 
 CELLS = 64  # along each axis of the cube around the unit sphere
 CLEARLY = 0.6  # the probability from which a pixel counts: a background's is below one half
-COARSE = 48  # pixels along the longer side, of masks of the typical shape
+COARSE = 96  # pixels along the longer side, of masks of typical shapes: at 48 thin legs were lost
+VIEWS = 12  # at most, of those that make hulls
 
 
-def whereabouts(stage: Stage, typical: SDF, like: Similarity) -> Similarity:
-    """Where a typical shape must lie for its visual hull to be as large as the object's, and in the same middle.
+def whereabouts(stage: Stage, typical: Sequence[SDF], like: Similarity) -> Similarity:
+    """Where typical shapes must lie for their visual hulls to be as large as the object's, and in the same middle.
 
     Masks make the hull, or else looks that are rarer outside the unit sphere's image. What views leave open, as that
-    below objects seen from above, is in both hulls. The place stays turned as it was; where there is no hull, as it is.
+    below objects seen from above, is in all hulls. The place stays turned as it was; where there is no hull, as it is.
     """
-    photographs = [each.at_most(COARSE) for each in stage.photographs]
-    known = _Extent.of([_silhouette(each, typical, like) for each in photographs], like)
-    views = zip(stage.photographs, _likely(stage), strict=True)
-    told = _Extent.of([view if view.mask is not None else replace(view, mask=some) for view, some in views], like)
+    masked = [
+        view if view.mask is not None else replace(view, mask=likely)
+        for view, likely in zip(stage.photographs, _likely(stage), strict=True)
+    ]
+    some = masked[:: -(-len(masked) // VIEWS)]
+    coarse = [each.at_most(COARSE) for each in some]
+    known = _Extent.typical([_Extent.of([_silhouette(each, sdf, like) for each in coarse], like) for sdf in typical])
+    told = _Extent.of(some, like)
     if known is None or told is None:
         return like
     growth = told.radius / known.radius
@@ -53,6 +58,15 @@ class _Extent:
         turned_back = places[solid] @ like.rotation
         middle = (turned_back.amin(0) + turned_back.amax(0)) / 2
         return _Extent(like.turned(middle), (turned_back - middle).norm(dim=-1).max())
+
+    @staticmethod
+    def typical(extents: "Sequence[_Extent | None]") -> "_Extent | None":
+        """The medians of those that there are: a single shape may have lost its legs."""
+        found = [each for each in extents if each is not None]
+        if not found:
+            return None
+        middles, radii = (torch.stack([getattr(each, name) for each in found]) for name in ("middle", "radius"))
+        return _Extent(middles.median(0).values, radii.median())
 
 
 @torch.no_grad()

@@ -19,7 +19,9 @@ DARK = 0.15  # brightness that most pixels along the edges of the images stay be
 SAMPLED = 200_000  # pixels that tell the background's colours
 NOISE = 1 / 255  # standard deviation of a colour, at least
 THREAD = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
-HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows
+HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows …
+NICHE = 1e-2  # … and so are those that are smaller than this, if their median colour is none of the background's:
+UNLIKELY = 4.03  # standard deviations, beyond which lies one in a thousand of a Gaussian's draws in three dimensions
 LIT = 4  # pixels: what is between background and object, and deeper in the latter, is its shadow; the rest is lit cloth
 UNSURE = 2  # pixels on each side of an outline, within which its place is where the image changes most
 
@@ -74,7 +76,14 @@ def _stands_out(apart: np.ndarray, low: float, high: float) -> np.ndarray:
     core = erosion(surely, disk(UNSURE)) | skeletonize(surely) | erosion(about, disk(LIT))  # a skeleton keeps threads
     markers = np.where(dilation(about, disk(UNSURE)), 0, 1)
     markers[core] = 2
-    return np.asarray(watershed(sobel(apart), markers) == 2)
+    return _with_niches(np.asarray(watershed(sobel(apart), markers) == 2), apart)
+
+
+def _with_niches(mask: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """With the holes that are too small for background, and lighter."""
+    parts = np.asarray(label(remove_small_holes(mask, max_size=round(NICHE * mask.size)) & ~mask, connectivity=1))
+    lighter = [hole for hole in range(1, parts.max() + 1) if np.median(apart[parts == hole]) > UNLIKELY]
+    return mask | np.isin(parts, lighter)
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
