@@ -8,6 +8,7 @@ from bumpy import bumpy_balls
 from test_fit_photos import COMPARED, GREY, TRUE, photographs, ring
 
 from distrace.data.photograph import Photograph
+from distrace.field import SDF, placed
 from distrace.photo_stage import Stage
 from distrace.pose import Similarity
 from distrace.whereabouts import whereabouts
@@ -20,8 +21,9 @@ def views() -> list[Photograph]:
     return photographs(bumpy_balls(), ring(), SHIFTED)
 
 
-def found(views: list[Photograph]) -> Similarity:
-    return whereabouts(Stage.of(views, 1.0, COMPARED), [bumpy_balls().field(TRUE)], Similarity.identity())
+def found(views: list[Photograph], *others: SDF) -> Similarity:
+    typical = [bumpy_balls().field(TRUE), *others]
+    return whereabouts(Stage.of(views, 1.0, COMPARED), typical, Similarity.identity())
 
 
 @pytest.mark.parametrize("masked", [False, True])
@@ -31,6 +33,13 @@ def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool
     there = found(views)
     assert (there.translation - SHIFTED.translation).norm() < 0.08  # a pixel is 0.04
     assert float(there.scale) == pytest.approx(0.8, abs=0.05)
+
+
+def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> None:
+    lost = placed(bumpy_balls().field(TRUE), torch.diag(torch.tensor([0.3, 0.3, 0.3, 1.0])))
+    there, again = found(views), found(views, bumpy_balls().field(TRUE), lost)
+    assert float(again.scale) == pytest.approx(float(there.scale), abs=0.01)
+    assert float(found(views, lost, lost).scale) > 2 * float(there.scale), "what most of them say counts"
 
 
 def test_photographs_of_nothing_say_nothing(views: list[Photograph]) -> None:

@@ -127,7 +127,7 @@ def terms_of(
     return {
         "colour": (made - seen.colours).abs().sum() / 3 / pixels.is_object.sum().clamp_min(1),
         "patches": matching.term(surface, *inner) if shapes else made.new_zeros(()),
-        "outline": _outline_term(pixels, bounds, trace, ~right, surface, sharpness),
+        "outline": _outline_term(pixels, bounds, trace, ~right | ~pixels.is_inner, surface, sharpness),
         "eikonal": _eikonal_term(points, surface, random),
     }
 
@@ -154,10 +154,14 @@ def coloured(
 
 
 def _outline_term(
-    pixels: Pixels, bounds: Bounds, trace: Trace, wrong: Bool[Tensor, "n"], surface: Surface, sharpness: float
+    pixels: Pixels, bounds: Bounds, trace: Trace, asked: Bool[Tensor, "n"], surface: Surface, sharpness: float
 ) -> Float[Tensor, ""]:
-    """Cross entropy of the rays' least values, where the object was missed or is not; as a share of all rays."""
-    rows = _rows(wrong)
+    """Cross entropy of some rays' least values, as a share of all rays.
+
+    IDR asks those that miss the object or should: background that is rightly missed pushes outlines inwards, and
+    nothing pulls. Here object that is rightly hit, by an outline, does.
+    """
+    rows = _rows(asked)
     with torch.no_grad():
         close = surface(pixels.rays[rows].at(trace.closest[rows])) < FAR_OFF
     rows = rows[close | pixels.is_object[rows]]
@@ -166,7 +170,7 @@ def _outline_term(
     values = surface(rays.at(minimum(surface, rays, closest, within, reach=SHELL, refine=REFINED)))
     object_is_there = pixels.is_object[rows].to(values)
     lacking = F.binary_cross_entropy_with_logits(-sharpness * values, object_is_there, reduction="sum")
-    return lacking / sharpness / len(wrong)
+    return lacking / sharpness / len(asked)
 
 
 def _eikonal_term(hits: Float[Tensor, "n 3"], surface: Surface, random: torch.Generator) -> Float[Tensor, ""]:
