@@ -99,5 +99,5 @@ def _shaded(view: View) -> Picture:
 def _apart(view: View, true: Solid) -> Picture:
     """How far what is seen is from the true surface."""
     distance = np.full(view.depth.shape, np.nan)
-    distance[view.seen.numpy()] = np.abs(true.distance(view.points().double().numpy()))
+    distance[view.seen.numpy()] = true.apart(view.points().double().numpy())
     return error_picture(distance, LIMIT)

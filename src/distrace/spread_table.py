@@ -50,7 +50,7 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
     mesh = extract_mesh(opened.field(steps[-1].code), MeshConfig())
     points = surface_points(mesh, LOOKED_AT, seed=0)
     apart = spread(opened, [step.code for step in others], torch.tensor(points, dtype=torch.float32)).numpy()
-    error, calm = np.abs(truth.distance(points)), apart < np.median(apart)
+    error, calm = truth.apart(points), apart < np.median(apart)
     return SpreadRow(
         category,
         name,

@@ -39,9 +39,13 @@ class Solid:
 
     def distance(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance to the outer surface, negative inside."""
+        return np.where(self.contains(points), -1.0, 1.0) * self.apart(points)
+
+    def apart(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """Distance to the outer surface, from either side: its sign costs winding numbers."""
         surface = self.surface
         squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces.astype(np.int64))
-        return np.where(self.contains(points), -1.0, 1.0) * np.sqrt(squared)
+        return np.sqrt(squared)
 
 
 def load_solid(path: Path) -> Solid:
