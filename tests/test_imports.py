@@ -51,7 +51,8 @@ ORDER = [
         "fit_photos",
         "doubtful",
     ),
-    *("surface_network", "matching", "motions", "reconstruction_terms", "reconstruct", "reconstruction_run"),
+    *("hash_grid", "surface_network", "matching", "motions"),
+    *("reconstruction_terms", "retouch", "reconstruct", "reconstruction_run"),
     "registration",
     *(
         "bench",

@@ -24,6 +24,7 @@ from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import SDF, value_and_gradient
+from distrace.hash_grid import GridSpecs, HashGrid
 from distrace.hull import overlaps, visual_hull
 from distrace.matching import Matching
 from distrace.motions import drift, motions, moved, relative
@@ -42,9 +43,9 @@ from distrace.trace import sphere_trace
 BLACK = torch.zeros(3)
 CPU = torch.device("cpu")
 SMALL = SurfaceSpecs(
-    width=32, layers=2, frequencies=3, features=4, colour_width=32, colour_layers=2, colour_frequencies=3
+    width=32, layers=2, frequencies=3, features=4, grid=GridSpecs(levels=3, finest=32, entries=512), colour_width=32
 )
-SHORT = ReconstructConfig(steps=150, hull_steps=200, sizes=(32,), rays=256, learning_rate=5e-3)
+SHORT = ReconstructConfig(steps=150, hull_steps=200, sizes=(32,), rays=256, learning_rate=5e-3, retouching=30)
 
 
 Command = Callable[..., None]
@@ -116,6 +117,39 @@ def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted
     assert fitted.evaluations > SHORT.steps * SHORT.rays
     first, last = fitted.course["colour"]
     assert last < first
+
+
+def test_a_grid_is_linear_between_its_corners_and_even_beyond_the_cube() -> None:
+    grid = HashGrid(GridSpecs(levels=2, coarsest=4, finest=8, entries=1000)).double()
+    a, b = torch.tensor([0.3, -0.2, 0.9]), torch.tensor([0.45, -0.2, 0.9])  # in one cell of both levels
+    ends = grid(torch.stack([a, b, (a + b) / 2]).double())
+    assert torch.allclose(ends[2], ends[:2].mean(0))
+    assert torch.equal(grid(torch.tensor([[2.0, 0.1, -3.0]])), grid(torch.tensor([[1.0, 0.1, -1.0]])))
+    points = (2 * torch.rand(20, 3, dtype=torch.float64) - 1).requires_grad_()
+    assert torch.autograd.gradcheck(grid, points)
+
+
+def test_each_corner_has_its_entry_and_fine_grids_share_theirs() -> None:
+    grid = HashGrid(GridSpecs(levels=2, coarsest=4, finest=32, entries=125))
+    corners = torch.cartesian_prod(*[torch.linspace(-1, 1, 5)] * 3)
+    assert len(grid(corners)[:, :2].unique(dim=0)) == 125
+    assert grid(torch.zeros(0, 3)).shape == (0, 4)
+    with pytest.raises(ValueError, match="makes no grids; at least one level"):
+        GridSpecs(levels=0)
+
+
+def test_retouching_moves_colours_alone(views: list[Photograph], fitted: Reconstruction) -> None:
+    config = replace(SHORT, retouching=60)
+    state, told = deepcopy(fitted), views[1:]
+    before, *_ = (judged(state, view, 40) for view in told)
+    list(reconstruct(told, state, config))
+    assert state.step == config.total == fitted.step + 30
+    after = judged(state, told[0], 40)
+    assert after.psnr > before.psnr
+    assert after.silhouette_iou == before.silhouette_iou
+    for one, other in zip(state.surface.parameters(), fitted.surface.parameters(), strict=True):
+        assert torch.equal(one, other)
+    assert torch.equal(state.steps_of_views, fitted.steps_of_views)
 
 
 def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]) -> None:
@@ -295,8 +329,8 @@ def test_the_command_writes_a_mesh_in_the_folders_world(views: list[Photograph],
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
     out = tmp_path / "out"
-    few = ["--steps", 30, "--sizes", 16, 32, "--rays", 128, "--width", 16, "--resolution", 32, "--held-out", 4]
-    run(tmp_path / "views", "--out", out, *few)
+    few = ["--steps", 30, "--retouching", 5, "--sizes", 16, 32, "--rays", 128, "--width", 16]
+    run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4)
     wanted = {"mesh.ply", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
     assert wanted <= {path.name for path in out.iterdir()}
     result = json.loads((out / "result.json").read_text())

@@ -19,6 +19,7 @@ from distrace.hull import visual_hull
 from distrace.matching import Matching
 from distrace.motions import motions, relative
 from distrace.reconstruction_terms import SHELL, Pool, terms_of, unit_length
+from distrace.retouch import Canvas
 from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
 
 SURVEYED = 400_000  # points, of which those near the hull's surface are kept
@@ -45,6 +46,8 @@ class ReconstructConfig:
     sharpness: float = 100.0  # of an outline at first, per radius: it doubles …
     sharpenings: int = 3  # … so often, evenly over the steps
     painting: float = 0.05  # of the steps, at first, in which colours are learnt and do not shape the surface
+    retouching: int = 1000  # steps after all others, of the colours alone …
+    retouched: int = 4096  # … and the pixels of each
     colours_shape: bool = True  # without, only outlines shape the surface: a visual hull
     seed: int = 0
 
@@ -52,9 +55,19 @@ class ReconstructConfig:
         if self.steps < 1 or self.rays < 4 or not self.sizes or min(self.sizes) < 8:
             given = f"{self.steps} steps of {self.rays} rays and images of {self.sizes} pixels"
             raise ValueError(f"{given} were asked for; at least 1 step, 4 rays and 8 pixels are needed")
+        if self.retouching < 0 or self.retouched < 1:
+            given = f"{self.retouching} steps of {self.retouched} pixels"
+            raise ValueError(f"{given} were asked for to retouch; at least 0 steps and 1 pixel are needed")
+
+    @property
+    def total(self) -> int:
+        """Steps, with those that retouch."""
+        return self.steps + self.retouching
 
     def rate(self, step: int) -> float:
-        return self.learning_rate * self.last_rate ** (step / self.steps)
+        """Falls exponentially, and once more while colours are retouched."""
+        part = step / self.steps if step < self.steps else (step - self.steps) / self.retouching
+        return self.learning_rate * self.last_rate**part
 
     def sharp(self, step: int) -> float:
         return self.sharpness * 2.0 ** (step * (self.sharpenings + 1) // self.steps)
@@ -96,10 +109,10 @@ class Reconstruction:
         """Of the views that are fitted to, in their order."""
         return motions(relative(self.steps_of_views))
 
-    def record(self, terms: dict[str, float], seconds: float) -> None:
-        """Counts a step done."""
+    def record(self, terms: dict[str, float], seconds: float, since: int = 0) -> None:
+        """Counts a step done, one of those that have these terms `since` some step."""
         for name, value in terms.items():
-            record(self.course.setdefault(name, []), self.step, value)
+            record(self.course.setdefault(name, []), self.step - since, value)
         self.step, self.seconds = self.step + 1, self.seconds + seconds
 
 
@@ -142,7 +155,7 @@ def begin_with_hull(state: Reconstruction, photographs: Sequence[Photograph], co
 def reconstruct(
     photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig = ReconstructConfig()
 ) -> Iterator[Step]:
-    """Fits in place and yields after every step, from wherever `state` is to the last one.
+    """Fits in place and yields after every step, from wherever `state` is to the last one: shapes, then retouches.
 
     The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
     Raises `ValueError` for photographs without masks, or masks without object.
@@ -154,18 +167,48 @@ def reconstruct(
             size = config.size(state.step)
             coarse = [each.at_most(size) for each in photographs]
             pool, matching = Pool.of(coarse), Matching.of(coarse, device)
-        for group in state.optimiser.param_groups:
-            group["lr"] = group["share"] * config.rate(state.step)
-        random = torch.Generator().manual_seed((config.seed << 32) + state.step)
+        random = _drawing(config, state.step)
         some, surface = pool.drawn(config.rays, random).to(device), CountedSurface(state.surface)
         shapes, sharp, moves = config.shapes(state.step), config.sharp(state.step), state.motions()
         terms = terms_of(some.moved(moves), matching.moved(moves), surface, state.colour, random, shapes, sharp)
         state.evaluations += surface.evaluations
-        weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()]).sum()
-        state.optimiser.zero_grad()
-        weighted.backward()
-        torch.nn.utils.clip_grad_norm_(state.surface.parameters(), STEEPEST)
-        state.optimiser.step()
-        told = {name: value.item() for name, value in terms.items()}
-        state.record(told, seconds := time.perf_counter() - began)
-        yield Step(state.step, told, seconds)
+        weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()])
+        yield _stepped(state, weighted.sum(), terms, config, began)
+    if state.step < config.total:
+        yield from _retouched(photographs, state, config)
+
+
+def _retouched(
+    photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig
+) -> Iterator[Step]:
+    """The last steps, of colours alone."""
+    began, surface = time.perf_counter(), CountedSurface(state.surface)
+    finest = Pool.of([each.at_most(config.sizes[-1]) for each in photographs]).pixels
+    with torch.no_grad():
+        pixels = finest.to(state.surface.last.weight.device).moved(state.motions())
+    canvas = Canvas.of(surface, pixels, _drawing(config, config.steps))
+    state.evaluations += surface.evaluations
+    while state.step < config.total:
+        term = canvas.term(state.colour, config.retouched, _drawing(config, state.step))
+        yield _stepped(state, term, {"retouch": term}, config, began)
+        began = time.perf_counter()
+
+
+def _drawing(config: ReconstructConfig, step: int) -> torch.Generator:
+    return torch.Generator().manual_seed((config.seed << 32) + step)
+
+
+def _stepped(
+    state: Reconstruction, loss: Tensor, terms: dict[str, Tensor], config: ReconstructConfig, began: float
+) -> Step:
+    """All that the loss depends on moves against its slope."""
+    for group in state.optimiser.param_groups:
+        group["lr"] = group["share"] * config.rate(state.step)
+    state.optimiser.zero_grad()
+    loss.backward()
+    torch.nn.utils.clip_grad_norm_(state.surface.parameters(), STEEPEST)
+    state.optimiser.step()
+    told = {name: value.item() for name, value in terms.items()}
+    since = 0 if state.step < config.steps else config.steps
+    state.record(told, seconds := time.perf_counter() - began, since)
+    return Step(state.step, told, seconds)

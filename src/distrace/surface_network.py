@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from distrace.field import Counted
+from distrace.hash_grid import GridSpecs, HashGrid
 
 BEND = 2e-4  # of the activation: nearly a ReLU, but with second derivatives
 
@@ -26,9 +27,9 @@ class SurfaceSpecs:
     layers: int = 4
     frequencies: int = 8  # of the positional encoding of points: 2⁰ … 2⁷ · π
     features: int = 32  # that the surface's network hands to the colours'
-    colour_width: int = 256
-    colour_layers: int = 3
-    colour_frequencies: int = 9  # as fine as pixels: it is asked at few points, and may be larger
+    grid: GridSpecs = GridSpecs()  # of the encoding of points for colours, as fine as pixels
+    colour_width: int = 64
+    colour_layers: int = 2
     light_width: int = 32
     view_frequencies: int = 1  # of the encoding of directions: what shines is smooth
     radius: float = 0.5  # of the ball that a surface begins as
@@ -107,7 +108,8 @@ class ColourNetwork(nn.Module):
     def __init__(self, specs: SurfaceSpecs = SurfaceSpecs()) -> None:
         super().__init__()
         self.specs = specs
-        own = 3 + 6 * specs.colour_frequencies + specs.features
+        self.grid = HashGrid(specs.grid)
+        own = specs.grid.levels * specs.grid.channels + 3 + specs.features
         self.own = _layers([own, *[specs.colour_width] * specs.colour_layers, 3])
         self.light = _layers([6 + 6 * specs.view_frequencies, specs.light_width, specs.light_width, 3])
 
@@ -119,7 +121,7 @@ class ColourNetwork(nn.Module):
         features: Float[Tensor, "*batch n"],
     ) -> Float[Tensor, "*batch 3"]:
         """Directions are those of rays, from the eye to the point."""
-        own = self.own(torch.cat([encoded(points, self.specs.colour_frequencies), features], dim=-1))
+        own = self.own(torch.cat([self.grid(points), points, features], dim=-1))
         light = self.light(torch.cat([normals, encoded(directions, self.specs.view_frequencies)], dim=-1))
         return (own + light).sigmoid()
 

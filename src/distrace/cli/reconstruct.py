@@ -36,7 +36,8 @@ class Reconstruct:
 
     views: tyro.conf.Positional[Views]
     out: Path = Path("out/reconstruct")
-    steps: int = ReconstructConfig.steps
+    steps: int = ReconstructConfig.steps  # that shape
+    retouching: int = ReconstructConfig.retouching  # steps after them, of the colours alone
     sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
     rays: int = ReconstructConfig.rays  # of each step
     width: int = SurfaceSpecs.width  # of the surface's network
@@ -66,8 +67,8 @@ class Reconstruct:
 
     @property
     def config(self) -> ReconstructConfig:
-        config = ReconstructConfig(steps=self.steps, sizes=self.sizes, rays=self.rays, seed=self.seed)
-        return replace(config, colours_shape=not self.silhouettes_only)
+        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "seed")}
+        return ReconstructConfig(**own, colours_shape=not self.silhouettes_only)
 
     @property
     def specs(self) -> SurfaceSpecs:
@@ -108,13 +109,13 @@ def fitted(
     names = [view.name for view in views]
     state = load_reconstruction(run.out, config, specs, names, run.device)
     if state.step:
-        console.print(f"going on from step {state.step} of {config.steps}")
+        console.print(f"going on from step {state.step} of {config.total}")
     else:
         console.print("carving what the masks allow, and teaching the network that")
         begin_with_hull(state, views, config)
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
-    saved, due = time.perf_counter(), -(-config.steps // PREVIEWS)
-    with progress("reconstructing", config.steps) as bar:
+    saved, due = time.perf_counter(), -(-config.total // PREVIEWS)
+    with progress("reconstructing", config.total) as bar:
         for step in reconstruct(views, state, config):
             bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.course.items()), to=step.step)
             if step.step % due == 0:
