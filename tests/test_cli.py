@@ -430,7 +430,14 @@ def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
     (tmp_path / "stopped").mkdir()
     (tmp_path / "stopped" / "checkpoint.pt").write_text("no checkpoint\n")
     write_samples(tmp_path / "good" / "chair.npz", of_sphere(0.5).astype(np.float32))
-    return {"tmp": str(tmp_path), "model": str(model), "view": str(observation), "out": str(tmp_path / "out")}
+    nowhere = np.array([[0.0, 0, 0], [1, 0, 0], [np.nan, 0, 0]])
+    for name, points in (("nan", nowhere), ("flat", np.nan_to_num(nowhere))):
+        trimesh.Trimesh(points, [[0, 1, 2]], process=False).export(tmp_path / f"{name}.ply")
+    np.save(tmp_path / "nan.npy", np.full(4, np.nan, dtype=np.float32))
+    save_view(tmp_path / "silhouette.npz", load_view(observation).without("depth"))
+    out, silhouette = str(tmp_path / "out"), str(tmp_path / "silhouette.npz")
+    view = {"view": str(observation), "silhouette": silhouette}
+    return {"tmp": str(tmp_path), "model": str(model), "out": out, **view}
 
 
 BAD = [
@@ -443,8 +450,8 @@ BAD = [
     ("render {tmp}/damaged", "not a DeepSDF specification"),
     ("render {model} --colour red", "--colour"),
     ("render {model} --size many", "--size"),
-    ("render {model} --out {tmp}/text", "is a file; give a folder"),
-    ("render {model} --out {tmp}/text/below", "text"),
+    ("render {model} --out {tmp}/text", "text is a file; give another to write to"),
+    ("render {model} --out {tmp}/text/below", "text is a file; give another to write to"),
     ("render {model} --code 2", "code 2 was asked for; spheres has 2"),
     ("render {model} --code -1", "code -1 was asked for"),
     ("render {model} --size -3", "-3 × -3"),
@@ -481,6 +488,10 @@ BAD = [
     ("complete {model} {view} --reference {tmp}/text", "no mesh and no cloud"),
     ("complete {model} {view} --reference {tmp}/missing.ply", "no mesh and no cloud"),
     ("complete {model} {view} --ignore depth", "--ignore"),
+    ("complete {model} {view} --seed -1", "--seed -1 was given; a number from 0"),
+    ("complete {model} {silhouette} --ignore mask", "without its mask has no depth and no mask"),
+    ("complete {model} {view} --reference {tmp}/nan.ply", "nan.ply is no mesh and no cloud of points"),
+    ("complete {model} {view} --reference {tmp}/flat.ply", "its faces have no area"),
     ("complete {tmp}/missing {view}", "neither a folder nor a bundled model"),
     ("complete {model} {view} --iterations 1 --resolution 3", "resolution of 3"),
     ("pose {model} {tmp}/missing.npz", "missing.npz is not an observation"),
@@ -490,6 +501,10 @@ BAD = [
     ("pose {model} {view} --ignore depth mask", "shows nothing of the object"),
     ("pose {model} {view} --starts 0", "0 starts"),
     ("pose {model} {view} --azimuth 0 --distance 0", "its own place"),
+    ("pose {model} {view} --elevation 5", "--elevation 5.0 --distance None were given without --azimuth"),
+    ("pose {model} {view} --disturb nan", "both finite"),
+    ("pose {model} {view} --disturb-focal inf", "both finite"),
+    ("pose {model} {view} --code {tmp}/nan.npy", "it has values that are not finite"),
     ("evaluate pose --model {model} --cameras 0", "--cameras 0"),
     ("evaluate training --model {model} --split sofas --meshes {tmp}/missing", "no shape in common"),
     ("evaluate training --model {model}", "there is no split"),
@@ -503,6 +518,8 @@ BAD = [
     ("evaluate sparse-depth --views 5", "--views 5"),
     ("evaluate sparse-depth --shapes 0", "--shapes 0"),
     ("evaluate spread --jobs 0", "--jobs 0"),
+    ("evaluate spread --classes", "--classes names none"),
+    ("evaluate multiview", "no clips were given"),
     ("evaluate noise --models {model}", "1 models"),
     ("evaluate sparse-depth --classes {tmp}/missing", "there is no split"),
     ("evaluate splits --splits {tmp}/missing", "there is no split"),
@@ -517,7 +534,9 @@ BAD = [
     ("sample {tmp}/meshes --count 5", "--count 5"),
     ("sample {tmp}/meshes --workers 0", "--workers 0"),
     ("sample {tmp}/meshes --split {tmp}/text", "lacks the columns"),
-    ("train {tmp}/missing", "holds no samples"),
+    ("train {tmp}/missing", "is no folder of samples or meshes"),
+    ("train {tmp}/good --minutes nan", "--minutes nan was given"),
+    ("train {tmp}/good --layers 0", "--layers 0 --width 512 were given"),
     ("train {tmp}/samples", "is not a file of samples"),
     ("train {tmp}/good --split sofas", "holds no samples"),
     ("train {tmp}/good --out {tmp}/stopped", "is not a checkpoint of a training run"),

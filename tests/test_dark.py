@@ -1,10 +1,16 @@
 """Masks of what stands before something dark."""
 
+from dataclasses import replace
+
+import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from distrace.data.dark import dark_masks
+from distrace.camera import Camera
+from distrace.data.dark import dark_masks, masked
+from distrace.data.photograph import Photograph
+from distrace.data.photographs import Photographs, Placement
 
 
 def ball(size: int = 160, radius: float = 40.0) -> Tensor:
@@ -54,3 +60,29 @@ def test_an_image_of_nothing_has_nothing_in_it() -> None:
     shown, empty = dark_masks([photographed(ball(), 0.02), blank])
     assert shown.any()
     assert not empty.any()
+
+
+def around() -> Photographs:
+    """Four views of the same image, of which the first has a mask: half of what it should be."""
+    image = photographed(ball(), 0.02)
+    cameras = [Camera.orbit(90 * k, 10, 3.0, height=160, width=160, focal_px=240.0) for k in range(4)]
+    views = [Photograph(f"{k}", camera, image) for k, camera in enumerate(cameras)]
+    half = ball(radius=20.0)
+    told = Placement(torch.zeros(3).double(), 1.0)
+    return Photographs((replace(views[0], mask=half), *views[1:]), told, "ours")
+
+
+def test_masks_that_are_given_stay_and_so_does_a_unit_sphere_that_was_told() -> None:
+    given = around()
+    for told in (True, False):
+        found = masked(replace(given, told=told))
+        assert torch.equal(found.views[0].known_mask, given.views[0].known_mask)
+        assert all(view.known_mask.any() for view in found.views)
+        assert (found.placement.radius == given.placement.radius) == told
+
+
+def test_black_images_end_in_one_sentence() -> None:
+    given = around()
+    black = [replace(view, image=torch.zeros_like(view.image), mask=None) for view in given.views]
+    with pytest.raises(ValueError, match="all 4 images have one brightness, 0.00: nothing stands out; give masks"):
+        masked(replace(given, views=tuple(black)))

@@ -8,9 +8,17 @@ from hypothesis import strategies as st
 from distrace import primitives
 from distrace.camera import Camera
 from distrace.field import Counted, chunked, narrowed, placed, value_and_gradient
+from distrace.mesh import MeshConfig, extract_mesh
 from distrace.render import render
 from distrace.trace import TraceConfig
 
+WRONG = {
+    "column": lambda p: p[..., :1],
+    "scalar": lambda p: p.sum(),
+    "number": lambda p: 0.5,
+    "double": lambda p: p[..., 0].double(),
+    "sign": lambda p: p[..., 0] > 0,
+}
 f64 = torch.float64
 fine = TraceConfig(steps=300, tolerance=1e-9, coarse_levels=0)
 
@@ -172,3 +180,15 @@ def test_without_grad_mode_there_is_a_gradient_but_no_graph(requires_grad: bool)
     assert not value.requires_grad
     assert not gradient.requires_grad
     torch.testing.assert_close(gradient.norm(dim=-1), torch.ones(20, dtype=f64))
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_field_that_gives_something_else_than_distances_is_told(name: str) -> None:
+    camera = Camera.orbit(30, 20, 3.0, height=4, width=4)
+    for ask in (
+        lambda: render(WRONG[name], camera),
+        lambda: render(WRONG[name], camera, config=TraceConfig()),
+        lambda: extract_mesh(WRONG[name], MeshConfig(16)),
+    ):
+        with pytest.raises(ValueError, match="the field gave .*; one distance for each is needed, torch.float32 of shape"):
+            ask()

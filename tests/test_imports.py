@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("errors", "files", "rays", "camera", "pose"),
+    *("errors", "files", "processes", "rays", "camera", "pose"),
     *("field", "primitives", "decoder", "checkpoint"),
     *(
         "trace",

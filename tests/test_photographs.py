@@ -83,6 +83,18 @@ def test_photographs_of_one_name_are_saved_side_by_side(tmp_path: Path) -> None:
     assert [view.name for view in load_photographs(tmp_path).views] == [f"00{k}_same" for k in range(4)]
 
 
+def test_photographs_of_one_name_in_several_folders_are_told_apart(tmp_path: Path) -> None:
+    def several(content: dict) -> None:
+        for number, entry in enumerate(content["views"]):
+            image = tmp_path / f"camera{number}" / "0000.png"
+            image.parent.mkdir()
+            (tmp_path / entry["image"]).rename(image)
+            entry["image"] = str(image.relative_to(tmp_path))
+
+    names = [view.name for view in load_photographs(own(tmp_path, several)).views]
+    assert names == [f"00{k}_0000" for k in range(4)]
+
+
 def test_without_a_unit_sphere_it_is_around_what_the_masks_show(tmp_path: Path) -> None:
     loaded = load_photographs(own(tmp_path, lambda content: content.pop("unit_sphere")))
     away = (loaded.placement.centre - WORLD.centre).norm().item()

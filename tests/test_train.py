@@ -1,5 +1,6 @@
 """Learning shapes: that it works, that a run goes on as if it had not been stopped, and what its files hold."""
 
+import json
 import os
 import signal
 import subprocess
@@ -33,6 +34,7 @@ from distrace.train import (
     start,
     train,
     training_loss,
+    Step,
 )
 
 CPU = torch.device("cpu")
@@ -336,4 +338,33 @@ def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytes
     capsys.readouterr()
     run("train", samples, "--out", out, "--steps", "3")
     assert "going on from step 3 of 3" in capsys.readouterr().out
+    assert_same_state(before["decoder"], checkpoint(out)["decoder"])
+    assert json.loads((out / "result.json").read_text())["loss"] == before["losses"][-1]
+
+
+def test_what_a_run_has_otherwise_is_not_taken_from_another_command(tmp_path: Path, run, capsys) -> None:
+    samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
+    run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
+    before = checkpoint(out)
+    for given, message in (
+        (("--width", "64"), "--width 64 was given, but the run in"),
+        (("--samples-per-step", "3"), "--samples-per-step 3 was given"),
+        (("--steps", "2"), "has done 3 already"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            run("train", samples, "--out", out, *given)
+        assert stop.value.code == 2
+        assert message in " ".join(capsys.readouterr().err.split())
+    assert_same_state(before["decoder"], checkpoint(out)["decoder"])
+
+
+def test_a_training_that_diverges_keeps_what_was_saved_before(tmp_path: Path, run, capsys, monkeypatch) -> None:
+    samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
+    run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
+    before = checkpoint(out)
+    lost = lambda *given: iter([Step(4, float("nan"), 0.1)])  # noqa: E731
+    monkeypatch.setattr(distrace.cli.train, "run_training", lost)
+    with pytest.raises(SystemExit):
+        run("train", samples, "--out", out, "--steps", "9")
+    assert "the training has diverged at step 4" in " ".join(capsys.readouterr().err.split())
     assert_same_state(before["decoder"], checkpoint(out)["decoder"])

@@ -230,4 +230,7 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
         if not state[key].isfinite().all():
             raise ValueError(f"{source}: {key} has values that are not finite; the training that wrote it has diverged")
     decoder.load_state_dict(state, assign=True)
+    for layer in range(decoder.depth):
+        if not getattr(decoder, f"lin{layer}").weight.isfinite().all():  # weight norm divides by a norm
+            raise ValueError(f"{source}: the weights of lin{layer} are not finite: its weight norm has a row of zeros")
     return decoder

@@ -10,6 +10,21 @@ SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
 """Signed distance at points of the unit sphere: positive outside, negative inside, the surface where it is zero."""
 
 
+def asked(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+    """The field's values, after a look at what they are: fields are also what users write.
+
+    Raises `ValueError` where they are not one distance for each point.
+    """
+    values = sdf(points)
+    if not isinstance(values, Tensor) or values.shape != points.shape[:-1] or values.dtype != points.dtype:
+        given = f"{values.dtype} of shape {list(values.shape)}" if isinstance(values, Tensor) else repr(values)
+        raise ValueError(
+            f"the field gave {given} at points of shape {list(points.shape)}; one distance for each is needed,"
+            f" {points.dtype} of shape {list(points.shape[:-1])}"
+        )
+    return values
+
+
 def value_and_gradient(
     sdf: SDF, points: Float[Tensor, "*batch 3"], *, second_order: bool = True
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
@@ -55,7 +70,7 @@ def placed(sdf: SDF, T_world_object: Float[Tensor, "4 4"]) -> SDF:
 def narrowed(sdf: SDF, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
     """Values at points, and a field that is the same around them; cheaper, where the field has a way to be."""
     narrow = getattr(sdf, "narrowed", None)
-    return narrow(points) if narrow else (sdf(points), sdf)
+    return narrow(points) if narrow else (asked(sdf, points), sdf)
 
 
 class Counted:

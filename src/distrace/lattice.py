@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
 
-from distrace.field import SDF, narrowed
+from distrace.field import SDF, asked, narrowed
 from distrace.rays import Bounds, Rays, meet_box
 
 INNER = 0.25  # of a cell's width: cells deeper inside than this are not halved, for rays meet the surface before them
@@ -94,7 +94,7 @@ def build(sdf: SDF, config: LatticeConfig = LatticeConfig(), like: Tensor = torc
     count = config.cells
     points = _corners(count, like)
     wanted = points.norm(dim=-1) <= 1 + 1 / count
-    values = _spread(torch.full_like(points[..., 0], torch.nan).masked_scatter(wanted, sdf(points[wanted])))
+    values = _spread(torch.full_like(points[..., 0], torch.nan).masked_scatter(wanted, asked(sdf, points[wanted])))
     slack = torch.full_like(values, config.steepest * 3**0.5 / count)
     evaluations = int(wanted.sum())
     near = sdf

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from distrace.field import SDF, narrowed
+from distrace.field import SDF, asked, narrowed
 
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
 
@@ -59,7 +59,7 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
     for level in range(LEVELS, 0, -1):
         width = 2 * config.radius / config.resolution * 2**level
         centres = (cells + 0.5) * width - config.radius
-        values, field = narrowed(sdf, centres) if level == 1 else (sdf(centres), sdf)
+        values, field = narrowed(sdf, centres) if level == 1 else (asked(sdf, centres), sdf)
         near = _in_ball(values, centres, config.radius).abs() <= config.steepest * width * 3**0.5 / 2
         cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
     return cells, field

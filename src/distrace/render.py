@@ -111,7 +111,9 @@ def render(
 
     The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera. The fast
     tracer takes over what a rendering before has learnt: `lattice`, of the same field, and `last`, the trace of nearly
-    the same field by nearly the same camera. Raises `ValueError` for a radius that is not positive.
+    the same field by nearly the same camera. Give a radius about as large as what there is to see, for the fast
+    tracer's accuracy is a part of it. Raises `ValueError` for a radius that is not positive, and for a field that does
+    not give one distance for each point.
     """
     if not radius > 0:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from distrace.field import SDF
+from distrace.field import SDF, asked
 from distrace.rays import Bounds, Rays
 
 
@@ -157,7 +157,7 @@ class _March:
             return False
         queried = under_way if config.compaction else (self.near < self.far).nonzero()[:, 0]
         self.evaluations[queried] += 1
-        value = sdf(self.rays[queried].at(self.t[queried]))
+        value = asked(sdf, self.rays[queried].at(self.t[queried]))
         if not config.compaction:
             value = value[self.outcome[queried] == -1]
         self._record(under_way, value)

@@ -97,14 +97,14 @@ def load_samples(paths: list[Path]) -> Samples:
     for path in paths:
         with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg"):
             with np.load(path, allow_pickle=False) as archive:
-                pos, neg = archive["pos"], archive["neg"]
+                pos, neg = (archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg"))
         for name, part in (("pos", pos), ("neg", neg)):
             if part.ndim != 2 or part.shape[1] != 4 or not len(part) or not np.isfinite(part).all():
                 raise ValueError(
                     f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed"
                 )
-        outside.append(torch.from_numpy(pos).float())
-        inside.append(torch.from_numpy(neg).float())
+        outside.append(torch.from_numpy(pos))
+        inside.append(torch.from_numpy(neg))
     return Samples([path.stem for path in paths], outside, inside)
 
 

@@ -67,6 +67,9 @@ def _run(arguments: list[str]) -> None:
         if stop.code:
             raise ValueError(_one_line(said.getvalue())) from None
         raise
+    seed = getattr(command, "seed", None)
+    if seed is not None and not 0 <= seed < 2**31:
+        raise ValueError(f"--seed {seed} was given; a number from 0 to {2**31 - 1} is needed")
     command.run()
 
 

@@ -13,7 +13,7 @@ from distrace.cli.common import ModelName, opened
 from distrace.cli.completion import Surface, Task, complete
 from distrace.cli.console import console, start
 from distrace.data.cloud import load_cloud
-from distrace.data.view import load_view
+from distrace.data.view import View, load_view
 from distrace.errors import explained
 from distrace.fit import FitConfig
 from distrace.fit_code import CodeFitConfig
@@ -53,6 +53,9 @@ class Complete:
             raise ValueError(f"{given} were given; one cannot be negative, and at least one point is needed")
         full = load_cloud(self.observation) if cloud else load_view(self.observation)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
+        if isinstance(known, View) and not (known.seen.any() or (known.mask is not None and known.mask.any())):
+            left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
+            raise ValueError(f"{self.observation}{left} has no depth and no mask of the object to complete it from")
         truth = None if self.reference is None else _reference(self.reference)
         complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
 
@@ -81,4 +84,9 @@ def _reference(path: Path) -> Surface:
         loaded: Any = trimesh.load(path, process=False)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
-        return loaded if len(getattr(loaded, "faces", ())) else np.asarray(loaded.vertices, dtype=np.float64)
+        vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), getattr(loaded, "faces", ())
+        if not len(vertices) or not np.isfinite(vertices).all():
+            raise ValueError("it has no points, or some that are not finite")
+        if len(faces) and not loaded.area > 0:
+            raise ValueError("its faces have no area")
+        return loaded if len(faces) else vertices

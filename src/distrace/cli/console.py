@@ -46,8 +46,9 @@ class Run:
 
 def start(out: Path, device: str = "cpu") -> Run:
     """Makes the folder. Raises `ValueError` for an `--out` that is a file, or a device that is not there."""
-    if out.exists() and not out.is_dir():
-        raise ValueError(f"--out {out} is a file; give a folder to write to")
+    for path in (out, *out.parents):
+        if path.exists() and not path.is_dir():
+            raise ValueError(f"--out {out} cannot be a folder, for {path} is a file; give another to write to")
     out.mkdir(parents=True, exist_ok=True)
     return Run(out, chosen_device(device))
 

@@ -27,7 +27,7 @@ from distrace.files import save_json, save_text
 from distrace.fit_code import CodeFitConfig
 from distrace.methods import METHODS
 from distrace.page import figure, page, section, table
-from distrace.trials import each_done
+from distrace.processes import each_done
 
 SHORT = {
     "rotation_median_degrees": "degrees",

@@ -20,7 +20,7 @@ from distrace.multiview_table import METHODS as METHODS_OF_CLIPS
 from distrace.multiview_table import ClipTrial, clip_done, described, multiview_rows, settings_of
 from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
 from distrace.spread_table import spread_rows
-from distrace.trials import each_done
+from distrace.processes import each_done
 
 
 @dataclass(frozen=True)
@@ -110,9 +110,10 @@ class Spread:
     def run(self) -> None:
         checked(self.jobs, self.shapes)
         run, rows = start(self.out), []
+        models = paired(self.classes, self.models)
         chosen = {category: held_out(category, self.shapes) for category in self.classes}
         with progress("spread", sum(map(len, chosen.values()))) as bar:
-            for category, model in paired(self.classes, self.models):
+            for category, model in models:
                 for row in spread_rows(category, chosen[category], model, self.meshes, self.jobs):
                     rows.append(asdict(row))
                     bar.advance(f"{row.shape}: {row.correlation:.2f}")
@@ -137,7 +138,9 @@ class Multiview:
     jobs: int = 2  # processes
 
     def run(self) -> None:
-        checked(self.jobs, len(self.clips))
+        checked(self.jobs, None)
+        if not self.clips:
+            raise ValueError("no clips were given; give folders as `distrace clip` makes them")
         for method in self.methods:
             settings_of(method)
         for folder in self.clips:
@@ -170,6 +173,8 @@ def checked(jobs: int, shapes: int | None, views: int = 1) -> None:
 def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, str], ...]:
     """Each class with its model. Raises `ValueError` for more or fewer of them."""
     models = models or classes
+    if not classes:
+        raise ValueError(f"--classes names none; give some of {', '.join(CLASSES)}, or CSV files")
     if len(models) != len(classes):
         given = f"{len(models)} models ({', '.join(models)}) were given"
         raise ValueError(f"{given} for {len(classes)} classes ({', '.join(classes)}); give one each")

@@ -40,7 +40,7 @@ class Multiview:
     seed: int = 0
 
     def run(self) -> None:
-        run = start(self.out)
+        run, resolved = start(self.out), MeshConfig(self.resolution)
         model, found = opened(self.model, run.device), load_photographs(self.views)
         console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}", markup=False)
         for note in notes(found):
@@ -55,7 +55,7 @@ class Multiview:
         for view in agreed:
             if view.doubtful:
                 console.print(_doubt(view), markup=False)
-        mesh = _mesh(model, last, found, MeshConfig(self.resolution))
+        mesh = _mesh(model, last, found, resolved)
         save_mesh(run.out / "mesh.ply", mesh)
         with written(run.out / "code.npy") as file:
             np.save(file, last.code.numpy())

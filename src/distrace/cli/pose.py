@@ -39,8 +39,8 @@ class Pose:
     ignore: tuple[Literal["depth", "mask", "normal"], ...] = ()  # parts of the observation to leave out
     focal: Flag = False  # also find the focal length
     azimuth: float | None = None  # degrees
-    elevation: float = 20.0  # degrees
-    distance: float = 4.97  # of the camera from the origin
+    elevation: float | None = None  # degrees; 20 where an azimuth is given
+    distance: float | None = None  # of the camera from the origin; 4.97 where an azimuth is given
     disturb: float | None = None  # degrees by which the start is turned, to try how well it is found again
     disturb_focal: float = 1.0  # by which the start's focal length is multiplied, to try the same of --focal
     starts: int = CameraConfig.starts
@@ -59,24 +59,35 @@ class Pose:
                 steps.append(step)
                 bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}, {step.off:.1%} of the rays off")
         last = steps[-1]
+        if not np.isfinite(last.loss):
+            raise ValueError(f"{self.observation}: no camera was found, for the loss is {last.loss}; is its camera right?")
         save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
         chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
         self._finish(run, observed, steps)
 
     def _start(self, camera: Camera) -> Camera:
-        if self.azimuth is not None:
-            around = Camera.orbit(self.azimuth, self.elevation, self.distance, focal_px=float(camera.intrinsics[0, 0]))
-            camera = replace(camera, T_world_camera=around.T_world_camera)
-        if not self.disturb_focal > 0:
-            raise ValueError(
-                f"--disturb-focal {self.disturb_focal} was given; a focal length is multiplied by more than 0"
-            )
+        if not 0 < self.disturb_focal < np.inf or not np.isfinite(self.disturb or 0.0):
+            given = f"--disturb {self.disturb} --disturb-focal {self.disturb_focal}"
+            raise ValueError(f"{given} were given; degrees and a positive factor are needed, both finite")
+        camera = replace(camera, T_world_camera=self._placed(camera))
         camera = zoomed(camera, torch.tensor(self.disturb_focal).log())
         if self.disturb is None:
             return camera
         axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed))
         return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros(3))
+
+    def _placed(self, camera: Camera) -> torch.Tensor:
+        """The pose to start from: the observation's own, or where the command says."""
+        elevation, distance = self.elevation, self.distance
+        if self.azimuth is not None:
+            where = self.azimuth, 20.0 if elevation is None else elevation, 4.97 if distance is None else distance
+            return Camera.orbit(*where, focal_px=float(camera.intrinsics[0, 0])).T_world_camera
+        if (elevation, distance) != (None, None):
+            raise ValueError(
+                f"--elevation {elevation} --distance {distance} were given without --azimuth; together they place the camera"
+            )
+        return camera.T_world_camera
 
     def _finish(self, run: Run, observed: View, steps: list[CameraStep]) -> None:
         last = steps[-1]
@@ -105,7 +116,10 @@ def _code(model: Model, given: str) -> int | torch.Tensor:
     if given.isdecimal():
         return int(given)
     with explained(f"--code {given} is neither the number of a training shape nor a code.npy"):
-        return torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
+        code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
+        if not code.isfinite().all():
+            raise ValueError("it has values that are not finite")
+        return code
 
 
 def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.Picture:

@@ -52,6 +52,7 @@ class Reconstruct:
     def run(self) -> None:
         torch.set_flush_denormal(True)
         run = start(self.out, self.device)
+        resolved = MeshConfig(self.resolution, device=run.device)
         found = masked(load_photographs(self.views))
         for note in notes(found):
             console.print(note, markup=False)
@@ -61,9 +62,7 @@ class Reconstruct:
                 console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
         state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
-        Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(
-            run, MeshConfig(self.resolution, device=run.device)
-        )
+        Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(run, resolved)
 
     @property
     def config(self) -> ReconstructConfig:

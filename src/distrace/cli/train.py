@@ -1,9 +1,11 @@
 """`train`: from samples to a model, going on where it was stopped."""
 
+import math
 import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 import tyro
@@ -26,6 +28,7 @@ from distrace.train import Samples, TrainConfig, Training, begin_with, faster_in
 from distrace.train import start as start_training
 from distrace.train import train as run_training
 
+DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
 TRIED = 20  # steps that tell how many fit into --minutes
 PREVIEWED = 5
 MESH_SAMPLES = 200_000  # of each mesh that is not sampled yet
@@ -42,16 +45,18 @@ class Train:
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
     large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
-    samples_per_step: int = TrainConfig.samples_per_step
-    layers: int = 8
-    width: int = 512
-    code_length: int = 256
+    samples_per_step: int | None = None  # 2,048
+    layers: int | None = None  # 8
+    width: int | None = None  # 512
+    code_length: int | None = None  # 256
     begin_with: str | None = None  # a model, bundled or in a folder, whose network and codes are learnt further
-    seed: int = 0
+    seed: int | None = None  # 0
     save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
     device: str = "cpu"
 
     def run(self) -> None:
+        if self.minutes is not None and not 0 < self.minutes < math.inf:
+            raise ValueError(f"--minutes {self.minutes} was given; a finite time is needed, longer than none")
         torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers: training was 2.3 times slower
         run = start(self.out, self.device)
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
@@ -59,26 +64,30 @@ class Train:
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
+            self._check_same(training, config)
             config = self._changed(config)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
             known = None if self.begin_with is None else opened(self.begin_with, run.device)
             specs = self._specs(known)
-            config = self._changed(TrainConfig(samples_per_step=self.samples_per_step, seed=self.seed))
+            config = replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
             training = start_training(len(loaded.names), specs, config, run.device)
             if known is not None:
                 begin_with(training, loaded.names, known)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         loss = _run(run, loaded, training, config, self.save_every)
-        facts = {"steps": config.steps, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
+        facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
     def _specs(self, known: Model | None) -> NetworkSpecs:
         """With weight norm, as DeepSDF has it; of a model's size if there is one."""
         if known is None:
-            sizes = (self.width,) * self.layers, self.code_length, (self.layers // 2,)
-            return NetworkSpecs(*sizes, norm_layers=tuple(range(self.layers)))
+            size = {**DEEPSDF, **_said(self, *DEEPSDF)}
+            layers, width, code_length = size.values()
+            if min(layers, width) < 1:
+                raise ValueError(f"--layers {layers} --width {width} were given; a network has at least one of each")
+            return NetworkSpecs((width,) * layers, code_length, (layers // 2,), norm_layers=tuple(range(layers)))
         specs = known.decoder.specs
         if specs.norm_layers and not specs.weight_norm:
             raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
@@ -86,8 +95,26 @@ class Train:
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""
-        said = {name: getattr(self, name) for name in ("steps", "wrong_sign", "large")}
-        return replace(config, **{name: value for name, value in said.items() if value is not None})
+        return replace(config, **_said(self, "steps", "wrong_sign", "large"))
+
+    def _check_same(self, training: Training, config: TrainConfig) -> None:
+        """Raises `ValueError` where something was said that a run which goes on has otherwise, or did already."""
+        specs = training.decoder.specs
+        has = {"samples_per_step": config.samples_per_step, "seed": config.seed, "code_length": specs.code_length}
+        has |= {"layers": len(specs.dims), "width": specs.dims[0]}
+        for name, value in _said(self, *has).items():
+            if value != has[name]:
+                option = f"--{name.replace('_', '-')}"
+                raise ValueError(
+                    f"{option} {value} was given, but the run in {self.out} has {has[name]}; give that, or another --out"
+                )
+        if self.steps is not None and self.steps < training.step:
+            raise ValueError(f"--steps {self.steps} was given, but the run in {self.out} has done {training.step} already")
+
+
+def _said(command: Train, *names: str) -> dict[str, Any]:
+    """Options that were given."""
+    return {name: getattr(command, name) for name in names if getattr(command, name) is not None}
 
 
 def _has_samples(folder: Path) -> bool:
@@ -108,7 +135,8 @@ def _sample_files(folder: Path, split: str | None) -> list[Path]:
         wanted = {shape.name for shape in on_side("train", split)}
         paths = [path for path in paths if path.stem.split("~")[0] in wanted]
     if not paths:
-        raise ValueError(f"{folder} holds no samples (.npz) to learn; `distrace sample` makes them")
+        what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"
+        raise ValueError(f"{folder} {what}; `distrace sample` makes them")
     return paths
 
 
@@ -123,10 +151,15 @@ def _as_long_as(
 
 def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, save_every: float) -> float:
     """Trains to the end, saving now and then; the mean loss of the last steps."""
-    saved, loss = time.perf_counter(), 0.0
+    saved, loss = time.perf_counter(), training.losses[-1] if training.losses else math.nan
     with progress("training", config.steps) as bar:
         for step in run_training(samples, training, config):
-            loss = step.loss if not loss else 0.98 * loss + 0.02 * step.loss
+            if not math.isfinite(step.loss):
+                raise ValueError(
+                    f"the training has diverged at step {step.step}; {run.out} has what was saved before. Let wrong signs"
+                    " and large errors count less, or look for samples that are far off"
+                )
+            loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
             if time.perf_counter() - saved > save_every:
                 _save(run, samples, training, config)

@@ -29,8 +29,8 @@ UNSURE = 2  # pixels on each side of an outline, within which its place is where
 def masked(photographs: Photographs) -> Photographs:
     """Photographs with masks: those that they have, or what stands out from a dark background.
 
-    Of these the unit sphere is put around what the masks allow. Raises `ValueError` where some have no mask and the
-    background is not dark.
+    Where there were some without, and nobody said where the unit sphere is, it is put around what the masks allow.
+    Raises `ValueError` where some have no mask and the background is not dark, or nothing stands out from it.
     """
     views = photographs.views
     if all(view.mask is not None for view in views):
@@ -43,8 +43,13 @@ def masked(photographs: Photographs) -> Photographs:
             f" pixels along the edges are brighter than {np.median(edges):.2f}; give masks, white where the object is"
         )
     masks = dark_masks([view.image for view in views])
-    told = tuple(replace(view, mask=mask) for view, mask in zip(views, masks, strict=True))
-    return _placed_again(Photographs(told, photographs.placement, photographs.layout))
+    found = tuple(
+        replace(view, mask=mask) if view.mask is None else view for view, mask in zip(views, masks, strict=True)
+    )
+    empty = [view.name for view in found if not view.known_mask.any()]
+    if 2 * len(empty) > len(found):
+        raise ValueError(f"in {len(empty)} of {len(found)} views, as {empty[0]}, nothing stands out from the dark; give masks")
+    return replace(photographs, views=found) if photographs.told else _placed_again(replace(photographs, views=found))
 
 
 def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torch.Tensor, "_ _"]]:
@@ -58,6 +63,8 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     colours = np.concatenate([image.numpy().reshape(-1, 3) for image in images])
     colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
     bright = colours.max(-1)
+    if bright.max() - bright.min() < NOISE:
+        raise ValueError(f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks")
     dark = colours[bright < threshold_li(bright)]
     mean, whiten = dark.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
     apart = _apart(colours, mean, whiten)
@@ -100,8 +107,7 @@ def _edge(image: np.ndarray) -> np.ndarray:
 def _placed_again(photographs: Photographs) -> Photographs:
     """In the sphere around what the masks allow."""
     views, before = photographs.views, photographs.placement
-    cameras, masks = [view.camera for view in views], [view.mask for view in views if view.mask is not None]
-    sphere = within_masks(cameras, masks)
+    sphere = within_masks(*zip(*((view.camera, view.known_mask) for view in views if view.known_mask.any())))
     placed = tuple(replace(view, camera=sphere.camera_to_unit(view.camera)) for view in views)
     there = Placement(before.to_world(sphere.centre), before.radius * sphere.radius)
-    return Photographs(placed, there, photographs.layout)
+    return replace(photographs, views=placed, placement=there)

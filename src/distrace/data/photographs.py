@@ -36,6 +36,7 @@ class Photographs:
     views: tuple[Photograph, ...]
     placement: Placement
     layout: str
+    told: bool = False  # whether the folder says where the unit sphere lies
 
 
 def load_photographs(folder: Path) -> Photographs:
@@ -46,18 +47,17 @@ def load_photographs(folder: Path) -> Photographs:
     shots = _described(folder)
     if len(shots.views) < 2:
         raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
-    views = [_photograph(shot) for shot in shots.views]
+    names = _distinct([shot.image.stem for shot in shots.views])
+    views = [replace(_photograph(shot), name=name) for shot, name in zip(shots.views, names)]
     with about(folder):
         placement = shots.placement or estimated(views, shots.points)
     placed = [replace(view, camera=_single(placement.camera_to_unit(view.camera))) for view in views]
-    return Photographs(tuple(placed), placement, shots.layout)
+    return Photographs(tuple(placed), placement, shots.layout, shots.placement is not None)
 
 
 def save_photographs(folder: Path, photographs: Photographs) -> None:
     """Our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
-    names = [view.name for view in photographs.views]
-    if len(set(names)) < len(names):
-        names = [f"{k:03d}_{name}" for k, name in enumerate(names)]
+    names = _distinct([view.name for view in photographs.views])
     entries = [_saved(folder, name, view, photographs.placement) for name, view in zip(names, photographs.views)]
     save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.placement.described()})
 
@@ -77,6 +77,11 @@ def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"]
 def notes(photographs: Photographs) -> list[str]:
     """Sentences about views that can be used but look wrong."""
     return [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    """The names; with numbers before them where two are the same, as in folders of several cameras."""
+    return list(names) if len(set(names)) == len(names) else [f"{k:03d}_{name}" for k, name in enumerate(names)]
 
 
 def _described(folder: Path) -> Shots:

@@ -1,7 +1,6 @@
 """Signed samples of a solid, in DeepSDF's distribution and file layout (Park et al., CVPR 2019, section 3)."""
 
-import json
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -74,8 +73,3 @@ def write_samples(path: Path, samples: Float[np.ndarray, "n 4"]) -> None:
     inside = samples[:, 3] < 0
     with written(path) as part:
         np.savez(part, pos=samples[~inside], neg=samples[inside])
-
-
-def write_report(path: Path, report: Doubt) -> None:
-    with written(path) as part:
-        part.write(json.dumps(asdict(report), indent=1).encode())

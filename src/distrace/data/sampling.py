@@ -3,17 +3,18 @@
 import json
 import zlib
 from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from dataclasses import dataclass
-from multiprocessing import get_context
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
-from distrace.data.samples import Doubt, doubt, sample, write_report, write_samples
+from distrace.data.samples import Doubt, doubt, sample, write_samples
 from distrace.data.solid import Solid, load_solid, turned
 from distrace.data.split import Shape
 from distrace.data.warp import lopsided, warped
+from distrace.errors import explained
+from distrace.files import save_json
+from distrace.processes import each_done
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,20 @@ class Job:
     def samples(self, variant: str = "") -> Path:
         return self.out / f"{self.shape.name}{variant}.npz"
 
+    @property
+    def report(self) -> Path:
+        return self.samples().with_suffix(".json")
+
+    def settings(self) -> dict[str, object]:
+        """All that its samples depend on."""
+        return {
+            "mesh": f"{zlib.crc32(self.mesh.read_bytes()):08x}",
+            "turn": self.shape.turn,
+            "count": self.count,
+            "mirror": self.mirror,
+            "variants": self.variants,
+        }
+
 
 def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, variants: int) -> list[Job]:
     """The shapes to sample; only those to train on have variants."""
@@ -42,15 +57,13 @@ def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool,
 
 
 def run(todo: list[Job], workers: int) -> Iterator[Doubt]:
-    """Does the jobs and yields their reports, those of an earlier run first."""
+    """Does the jobs and yields their reports, those of an earlier run first.
+
+    Raises `ValueError` for a report that is damaged, or of another mesh or other settings.
+    """
     reports = [_earlier(job) for job in todo]
     yield from (report for report in reports if report)
-    with ProcessPoolExecutor(workers, mp_context=get_context("spawn")) as pool:
-        pending = [pool.submit(run_one, job) for job, report in zip(todo, reports) if not report]
-        try:
-            yield from (future.result() for future in as_completed(pending))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    yield from each_done(run_one, [job for job, report in zip(todo, reports) if not report], workers)
 
 
 def run_one(job: Job) -> Doubt:
@@ -69,7 +82,7 @@ def run_one(job: Job) -> Doubt:
         report = doubt(job.shape.name, solid)
         if report.usable:
             _write(job, solid)
-    write_report(job.samples().with_suffix(".json"), report)
+    save_json(job.report, {**asdict(report), "settings": job.settings()})
     return report
 
 
@@ -85,5 +98,13 @@ def _write(job: Job, solid: Solid) -> None:
 
 
 def _earlier(job: Job) -> Doubt | None:
-    path = job.samples().with_suffix(".json")
-    return Doubt(**json.loads(path.read_text())) if path.exists() else None
+    if not job.report.exists() or not job.mesh.is_file():
+        return None
+    with explained(f"{job.report} is not what `sample` leaves of a shape; remove it to sample the shape anew"):
+        kept = json.loads(job.report.read_text())
+        before, now = kept.pop("settings"), job.settings()
+        report = Doubt(**kept)
+    others = [name for name, value in now.items() if before.get(name) != value]
+    if others:
+        raise ValueError(f"{job.out} has samples of {job.shape.name} with another {', '.join(others)}; give another --out")
+    return report if job.samples().exists() or not report.usable else None

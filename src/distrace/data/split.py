@@ -1,14 +1,17 @@
 """Which shapes a model is trained on and which are held out, fixed in a file: `splits/sofas.csv`."""
 
 import csv
+import math
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from importlib.resources import files
 from pathlib import Path
 
-from distrace.errors import explained
+from distrace.errors import about, explained
 
 CLASSES = ("sofas", "planes", "tables", "chairs")  # with bundled splits and models
+SIDES = ("train", "test", "out")
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".ac")
 
 
@@ -44,14 +47,30 @@ def read_split(name: str | Path) -> list[Shape]:
     if missing:
         raise ValueError(f"the split {name} lacks the columns {', '.join(missing)}")
     with explained(f"the split {name} cannot be read: each row needs all of its columns, and degrees as its turn"):
-        return [_shape(row) for row in rows]
+        shapes = [_shape(row) for row in rows]
+    with about(f"the split {name}"):
+        return _apart(shapes)
 
 
 def _shape(row: dict[str, str]) -> Shape:
     known = {column: row[column] for column in Shape.__dataclass_fields__ if column in row}
     if None in known.values():
         raise ValueError(f"{', '.join(filter(None, known.values()))} is too short")
-    return Shape(**{**known, "turn": float(row["turn"])})
+    shape = Shape(**{**known, "turn": float(row["turn"])})
+    if shape.split not in SIDES or not math.isfinite(shape.turn):
+        raise ValueError(f"{shape.name} has the side {shape.split!r} and the turn {shape.turn}")
+    return shape
+
+
+def _apart(shapes: list[Shape]) -> list[Shape]:
+    """The shapes, whose names are those of files in one folder beside the run's `result.json`."""
+    for name, count in Counter(shape.name for shape in shapes).items():
+        if count > 1:
+            paths = ", ".join(shape.path for shape in shapes if shape.name == name)
+            raise ValueError(f"{count} shapes are called {name} ({paths}); rename or remove all but one")
+        if name != Path(name).name or "\\" in name or name in ("", "..", "result"):
+            raise ValueError(f"a shape is called {name!r}, which cannot name its files; rename it")
+    return shapes
 
 
 def _bundled() -> str:
@@ -80,7 +99,8 @@ def every_mesh(folder: Path) -> list[Shape]:
     if not paths:
         raise ValueError(f"{folder} holds no mesh; files ending in {', '.join(MESH_SUFFIXES)} are looked for")
     names = ["-".join(path.with_suffix("").parts) for path in paths]
-    return [Shape(name, "train", name, 0.0, str(path), "", "") for name, path in zip(names, paths)]
+    with about(folder):
+        return _apart([Shape(name, "train", name, 0.0, str(path), "", "") for name, path in zip(names, paths)])
 
 
 def has_meshes(folder: Path) -> bool:

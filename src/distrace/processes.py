@@ -1,0 +1,48 @@
+"""Work that is done in several processes at once."""
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
+from multiprocessing import get_context
+from threading import current_thread, main_thread
+from typing import TypeVar
+
+import torch
+
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def each_done(work: Callable[[Task], Result], wanted: Sequence[Task], jobs: int) -> Iterator[Result]:
+    """The result of each task, as it is done; in so many processes of one thread each.
+
+    Where the caller stops, by Ctrl-C or otherwise, they are ended: what they write must be whole or absent.
+    """
+    context = get_context("spawn")
+    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=torch.set_num_threads, initargs=(1,))
+    with _deaf_children():
+        pending = [pool.submit(work, task) for task in wanted]
+    workers = list((pool._processes or {}).values())  # a public way to end them comes with Python 3.14
+    try:
+        for done in as_completed(pending):
+            yield done.result()
+    except BaseException:
+        for worker in workers:
+            worker.terminate()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _deaf_children() -> Iterator[None]:
+    """Processes that begin here do not hear Ctrl-C, which a terminal sends to all of them: who began them does."""
+    if current_thread() is not main_thread():  # which alone hears signals
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

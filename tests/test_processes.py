@@ -1,0 +1,67 @@
+"""Work in several processes, and how it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from distrace.processes import each_done
+
+
+def begun(folder: Path, number: int) -> int:
+    """Leaves the number of its process, and takes as many seconds as its own number says."""
+    (folder / str(number)).write_text(str(os.getpid()))
+    time.sleep(number)
+    return number
+
+
+def alive(process: int) -> bool:
+    try:
+        os.kill(process, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def waited_for(path: Path) -> None:
+    patience = time.monotonic() + 120
+    while not path.exists() or not path.read_text():
+        assert time.monotonic() < patience
+        time.sleep(0.05)
+
+
+def test_results_come_as_they_are_done_and_what_is_left_ends_with_the_caller(tmp_path: Path) -> None:
+    results = each_done(partial(begun, tmp_path), [300, 0], jobs=2)
+    assert next(results) == 0
+    waited_for(tmp_path / "300")
+    began, process = time.monotonic(), int((tmp_path / "300").read_text())
+    results.close()
+    assert time.monotonic() - began < 60
+    assert not alive(process)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="its consoles have no process groups")
+def test_ctrl_c_reaches_all_processes_and_only_the_first_speaks(tmp_path: Path) -> None:
+    program = (
+        "from functools import partial; from pathlib import Path; from test_processes import begun\n"
+        "from distrace.processes import each_done\n"
+        "if __name__ == '__main__':\n"
+        "    try: list(each_done(partial(begun, Path(r'{folder}')), [60], 1))\n"
+        "    except KeyboardInterrupt: print('stopped')\n"
+    )
+    script = tmp_path / "work.py"
+    script.write_text(program.format(folder=tmp_path))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    pipe = subprocess.PIPE
+    process = subprocess.Popen(
+        [sys.executable, script], stdout=pipe, stderr=pipe, env=environment, start_new_session=True, text=True
+    )
+    waited_for(tmp_path / "60")
+    os.killpg(process.pid, signal.SIGINT)
+    said, complained = process.communicate(timeout=50)
+    assert (said.strip(), complained.strip()) == ("stopped", "")
