@@ -28,13 +28,13 @@ ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
 
 @dataclass(frozen=True)
 class CodeFitConfig(Starts):
-    """Steps in stages. Each begins with a look along all rays; deviations beyond a scale count less.
+    """Steps in stages, in which deviations beyond a scale count less.
 
     In the first stages, whose scale narrows, by their absolute values; in the last ones hardly.
     """
 
     iterations: int = 16
-    kept: int = 3  # all: what a few iterations reach says little about the end
+    kept: int = 3  # all of three starts: what a few iterations reach says little about the end
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates

@@ -72,8 +72,11 @@ def fit_photos(
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
     place: that given or, if it is unknown and they contradict it less there, where the photographs tell; the one whose
-    loss falls lowest goes on. Raises `ValueError` for fewer than two photographs.
+    loss falls lowest goes on. On the CPU alone. Raises `ValueError` for fewer than two photographs, and for a decoder on
+    another device.
     """
+    if prior.mean.device.type != "cpu":
+        raise ValueError(f"the decoder is on {prior.mean.device}; photographs are fitted on the CPU: move it there")
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     stages = [Stage.of(photographs, level, config.compared) for level in config.levels]

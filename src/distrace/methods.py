@@ -24,6 +24,7 @@ def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitC
     """
     if method not in METHODS + CLOUDS:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS + CLOUDS)}")
+    view = view.to(model.codes.device)
     cloud = Cloud(view.points(), None if view.normal is None else view.normal[view.seen])
     if method == "deepsdf":
         assert cloud.normals is not None, "DeepSDF is given the true normals"
@@ -41,7 +42,11 @@ def settings_of(method: str, config: FitConfig | CodeFitConfig) -> FitConfig | C
 def completing(
     model: Model, seen: View | Cloud, config: FitConfig | CodeFitConfig, prior: Prior | None = None
 ) -> Iterator[Step]:
-    """Ours: from a view by either solver, from points by Levenberg–Marquardt; a prior replaces that of the codes."""
+    """Ours: from a view by either solver, from points by Levenberg–Marquardt; a prior replaces that of the codes.
+
+    On the model's device, wherever what was seen is.
+    """
+    seen = seen.to(model.codes.device)
     prior = prior_of(model.codes) if prior is None else prior
     if isinstance(seen, Cloud):
         samples = on_surface(seen.points) if seen.normals is None else around_points(seen.points, seen.normals)

@@ -71,7 +71,7 @@ def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "heigh
 
 
 def _outside(inside: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 2"]:
-    y, x = torch.from_numpy(distance_transform_edt(~inside.numpy(), return_distances=False, return_indices=True))
+    y, x = torch.from_numpy(distance_transform_edt(~inside.cpu().numpy(), return_distances=False, return_indices=True))
     rows, columns = torch.meshgrid(*(torch.arange(size) for size in inside.shape), indexing="ij")
     return torch.stack([columns - x, rows - y], dim=-1).float()
 

@@ -36,7 +36,7 @@ class Pool:
 
     @staticmethod
     def of(view: View) -> "Pool":
-        nothing = torch.empty(0, dtype=torch.int64)
+        nothing = torch.empty(0, dtype=torch.int64, device=view.depth.device)
         with_depth = view.seen.reshape(-1).nonzero()[:, 0]
         if view.mask is None:
             known = with_depth if len(with_depth) else view.observed.reshape(-1).nonzero()[:, 0]

@@ -49,7 +49,7 @@ class Pose:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model, observed = opened(self.model, run.device), read_view(self.observation)
+        model, observed = opened(self.model, run.device), read_view(self.observation).to(run.device)
         field = model.field(_code(model, self.code))
         first = self._start(observed.camera)
         steps = []
@@ -74,15 +74,16 @@ class Pose:
         camera = zoomed(camera, torch.tensor(self.disturb_focal).log())
         if self.disturb is None:
             return camera
-        axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed))
-        return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros(3))
+        axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed)).to(camera.intrinsics)
+        return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros_like(axis))
 
     def _placed(self, camera: Camera) -> torch.Tensor:
         """The pose to start from: the observation's own, or where the command says."""
         elevation, distance = self.elevation, self.distance
         if self.azimuth is not None:
             where = self.azimuth, 20.0 if elevation is None else elevation, 4.97 if distance is None else distance
-            return Camera.orbit(*where, focal_px=float(camera.intrinsics[0, 0])).T_world_camera
+            around = Camera.orbit(*where, focal_px=float(camera.intrinsics[0, 0]))
+            return around.T_world_camera.to(camera.T_world_camera)
         if (elevation, distance) != (None, None):
             raise ValueError(
                 f"--elevation {elevation} --distance {distance} were given without --azimuth; together they place the camera"

@@ -23,6 +23,9 @@ class Cloud:
     points: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
 
+    def to(self, device: torch.device | str) -> "Cloud":
+        return Cloud(self.points.to(device), None if self.normals is None else self.normals.to(device))
+
     def sparse(self, count: int, seed: int = 0) -> "Cloud":
         """At most so many of the points, drawn at random."""
         chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]

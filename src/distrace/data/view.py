@@ -37,6 +37,10 @@ class View:
         known = self.seen if self.mask is None else self.seen | self.mask
         return known if self.normal is None else known | self.normal.any(-1)
 
+    def to(self, device: torch.device | str) -> "View":
+        mask, normal = (None if image is None else image.to(device) for image in (self.mask, self.normal))
+        return View(self.camera.to(device), self.depth.to(device), mask, normal)
+
     def points(self) -> Float[Tensor, "n 3"]:
         """The observed points, in the world."""
         rays = self.camera.rays()
