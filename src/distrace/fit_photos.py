@@ -4,6 +4,7 @@ From coarse images to fine ones, by Levenberg–Marquardt. As in DIST (Liu et al
 similarity are found together, from several starts.
 """
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -14,6 +15,7 @@ import torch
 
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
+from distrace.field import Counted
 from distrace.photo_residuals import Shape
 from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
@@ -59,6 +61,7 @@ class PhotoStep(Step):
     """The code and the place after an iteration."""
 
     place: Similarity = field(default_factory=Similarity.identity)
+    searched: int = 0  # of the evaluations, those of the search for starts: in the first step
 
 
 def fit_photos(
@@ -79,58 +82,80 @@ def fit_photos(
         raise ValueError(f"the decoder is on {prior.mean.device}; photographs are fitted on the CPU: move it there")
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
-    stages = [Stage.of(photographs, level, config.compared) for level in config.levels]
-    there = place or Similarity.identity()
+    return _fitted(decoder, photographs, prior, config, place or Similarity.identity())
+
+
+def _fitted(
+    decoder: Decoder, photographs: Sequence[Photograph], prior: Prior, config: PhotoConfig, there: Similarity
+) -> Iterator[PhotoStep]:
+    """The first step is charged with the search for starts."""
+    began, stages, search = time.perf_counter(), _pyramid(photographs, config), Search(decoder, prior, config.seed)
     if config.compared.moves:
+        there = search.likelier(stages[0], config.compared, (there, search.told(stages[-1], there)))
+    starts = [Shape(w, there) for w in search.starts(stages[0], config, there)]
+    searched = time.perf_counter() - began
+    steps = best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), recent=1)
+    step = next(steps)
+    evaluations = step.evaluations + search.evaluations
+    yield replace(step, seconds=step.seconds + searched, evaluations=evaluations, searched=search.evaluations)
+    yield from steps
+
+
+def _pyramid(photographs: Sequence[Photograph], config: PhotoConfig) -> list[Stage]:
+    """A stage for each level; those of one level are the same."""
+    kinds = {level: Stage.of(photographs, level, config.compared) for level in sorted(set(config.levels))}
+    return [kinds[level] for level in config.levels]
+
+
+@dataclass
+class Search:
+    """Where fits begin: which places and training shapes contradict photographs least; and the evaluations so far."""
+
+    decoder: Decoder
+    prior: Prior
+    seed: int = 0
+    evaluations: int = 0
+
+    def told(self, stage: Stage, like: Similarity) -> Similarity:
+        """Where the photographs let an object of the class be."""
+        prior = self.prior
         typical = sorted((prior.coordinates(code) for code in prior.codes), key=torch.norm)[:TYPICAL]
-        shapes = [decoder.field(prior.code(w)) for w in typical or [prior.start(0, config.seed)]]
-        told = whereabouts(stages[-1], shapes, there)
-        there = _likelier(decoder, stages[0], prior, config, (there, told))
-    starts = [Shape(w, there) for w in _starts(decoder, stages[0], prior, config, there)]
-    return best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), recent=1)
+        shapes = [Counted(self.decoder.field(prior.code(w))) for w in typical or [prior.start(0, self.seed)]]
+        place = whereabouts(stage, shapes, like)
+        self.evaluations += sum(shape.evaluations for shape in shapes)
+        return place
 
+    def likelier(self, stage: Stage, compared: Comparing, places: Sequence[Similarity]) -> Similarity:
+        """The place where a few shapes contradict the photographs least."""
+        few, prior = replace(compared, rays=SCREENED), self.prior
+        some = prior.codes[:: max(1, -(-len(prior.codes) // ASKED))]
+        shapes = [prior.start(0, self.seed), *(prior.coordinates(code) for code in some)]
+        return min(places, key=lambda place: median(self._loss(stage, few, Shape(w, place)) for w in shapes))
 
-def _likelier(
-    decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, places: Sequence[Similarity]
-) -> Similarity:
-    """The place where a few shapes contradict the photographs least."""
-    few = replace(config.compared, rays=SCREENED)
-    some = prior.codes[:: max(1, -(-len(prior.codes) // ASKED))]
-    shapes = [prior.start(0, config.seed), *(prior.coordinates(code) for code in some)]
+    def ranked(self, stage: Stage, compared: Comparing, place: Similarity) -> list[tuple[float, torch.Tensor]]:
+        """The losses and coordinates of the best training shapes, the least loss first; of all of them, on fewer rays."""
+        codes = [self.prior.coordinates(code) for code in self.prior.codes]
+        for rays in (min(SCREENED, compared.rays), compared.rays):
+            losses = [self._loss(stage, replace(compared, rays=rays), Shape(w, place)) for w in codes]
+            order = sorted(range(len(codes)), key=lambda number: losses[number])
+            codes = [codes[number] for number in order[: max(len(self.prior.codes) // KEPT, FEWEST)]]
+        return [(losses[number], w) for number, w in zip(order, codes)]
 
-    def contradicted(place: Similarity) -> float:
-        return median(_loss(decoder, stage, prior, few, Shape(w, place), config.seed) for w in shapes)
+    def starts(self, stage: Stage, config: PhotoConfig, place: Similarity) -> list[torch.Tensor]:
+        """The mean's coordinates, those of training shapes, and a draw."""
+        few, wanted = replace(config.compared, rays=COMPARED), config.starts - 2
+        nearest = [w for _, w in self.ranked(stage, few, place)[:wanted]] if wanted > 0 else []
+        draws = [self.prior.start(k, self.seed) for k in range(1, config.starts - len(nearest))]
+        return [self.prior.start(0, self.seed), *nearest, *draws]
 
-    return min(places, key=contradicted)
-
-
-def ranked(
-    decoder: Decoder, stage: Stage, prior: Prior, config: Comparing, place: Similarity, seed: int = 0
-) -> list[tuple[float, torch.Tensor]]:
-    """The losses and coordinates of the best training shapes, the least loss first; of all of them, on fewer rays."""
-    codes = [prior.coordinates(code) for code in prior.codes]
-    for rays in (min(SCREENED, config.rays), config.rays):
-        losses = [_loss(decoder, stage, prior, replace(config, rays=rays), Shape(w, place), seed) for w in codes]
-        order = sorted(range(len(codes)), key=lambda number: losses[number])
-        codes = [codes[number] for number in order[: max(len(prior.codes) // KEPT, FEWEST)]]
-    return [(losses[number], w) for number, w in zip(order, codes)]
-
-
-def _loss(decoder: Decoder, stage: Stage, prior: Prior, config: Comparing, shape: Shape, seed: int) -> float:
-    """Of colours and outlines, on rays that are the same for all shapes."""
-    problem, look = stage.problem(decoder, prior, shape, config, torch.Generator().manual_seed(seed))
-    terms = problem.terms(look, problem.residuals(look))
-    return terms["colour"] + terms["outline"]
-
-
-def _starts(decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, place: Similarity) -> list[torch.Tensor]:
-    """The mean's coordinates, those of training shapes, and a draw."""
-    if config.starts == 1:
-        return [prior.start(0, config.seed)]
-    few = replace(config.compared, rays=COMPARED)
-    nearest = [w for _, w in ranked(decoder, stage, prior, few, place, config.seed)[: config.starts - 2]]
-    draws = [prior.start(k, config.seed) for k in range(1, config.starts - len(nearest))]
-    return [prior.start(0, config.seed), *nearest, *draws]
+    def _loss(self, stage: Stage, compared: Comparing, shape: Shape) -> float:
+        """Of colours and outlines, on rays that are the same for all shapes; infinite where no view is contradicted
+        because none sees the shape."""
+        random = torch.Generator().manual_seed(self.seed)
+        problem, look = stage.problem(self.decoder, self.prior, shape, compared, random)
+        terms = problem.terms(look, problem.residuals(look))
+        self.evaluations += problem.evaluations
+        return terms["colour"] + terms["outline"] if look.hit.any() else math.inf
 
 
 def _solved(

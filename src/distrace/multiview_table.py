@@ -26,7 +26,7 @@ from distrace.data.view import View
 from distrace.errors import explained
 from distrace.files import save_json, written
 from distrace.fit_code import CodeFitConfig, fit_code
-from distrace.fit_photos import PhotoConfig, fit_photos, ranked
+from distrace.fit_photos import PhotoConfig, Search, fit_photos
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photo_stage import Comparing, Stage
@@ -59,7 +59,8 @@ class ClipTrial:
     def file(self, suffix: str) -> Path:
         """What the trial leaves: its figures (.json), and its surface (.ply)."""
         clip = described(self.folder)
-        return self.out / "trials" / f"{clip['shape']}_{clip['background']}_{self.method}{suffix}"
+        name = "_".join((clip["shape"], clip["background"], clip["texture"], self.method))
+        return self.out / "trials" / f"{name}{suffix}"
 
 
 @dataclass(frozen=True)
@@ -96,7 +97,7 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
     clip = described(trial.folder)
     model = opened_once(trial.model or clip["split"])
-    mark = fingerprint(model, clip["seed"], clip["frames"], clip["size"], clip["samples"], settings_of(trial.method))
+    mark = fingerprint(model, tuple(sorted(clip.items())), settings_of(trial.method))
     if trial.file(".json").is_file() and trial.file(".ply").is_file():
         kept = read_json(trial.file(".json"))
         if kept.pop("made_by", None) == mark:
@@ -164,7 +165,7 @@ def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[
         return step.code, still
     if trial.method == "nearest":
         stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
-        best = ranked(model.decoder, stage, prior, KNOWN_PLACE.compared, still)[0]
+        best = Search(model.decoder, prior).ranked(stage, KNOWN_PLACE.compared, still)[0]
         return prior.code(best[1]), still
     moves = trial.method != "ours"
     config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=moves))

@@ -100,7 +100,8 @@ class PhotoProblem:
         start = bounds.near if last is None else torch.where(last.hit, last.distance - BACK, bounds.near)
         sdf = Counted(self.decoder.field(self.prior.code(shape.w)))
         trace = sphere_trace(sdf, rays, bounds, MARCH, start)
-        t, hit = trace.closest.clone(), trace.hit
+        nearest = -(rays.origins * rays.directions).sum(-1)  # to the middle, of rays that do not meet the sphere
+        t, hit = torch.where(bounds.meets, trace.closest, nearest), trace.hit
         wrong = bounds.meets & torch.where(hit, sure < 0, sure > 0)
         aside = (bounds.meets & ~hit & (sure < 0)).nonzero()[:, 0]
         wrong[aside] = sdf(rays[aside].at(t[aside])) < ATTENTION

@@ -10,7 +10,7 @@ from torch import Tensor
 from distrace.consensus import agreed
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
-from distrace.field import SDF
+from distrace.field import SDF, Counted
 from distrace.photo_pairs import Colours, partners, without_light
 from distrace.photo_residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
 from distrace.pose import Similarity
@@ -69,7 +69,7 @@ class Stage:
         view, index = self._drawn(config.rays, random)
         rays = self._rays(view, index)
         compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
-        in_object, sdf = shape.place.rays_in_object(rays), decoder.field(prior.code(shape.w))
+        in_object, sdf = shape.place.rays_in_object(rays), Counted(decoder.field(prior.code(shape.w)))
         trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
         sure = self._certainty(view, index, trace.hit)
         far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
@@ -80,7 +80,7 @@ class Stage:
         visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
         pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
         problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves)
-        problem.evaluations += trace.total_evaluations + len(view)
+        problem.evaluations += sdf.evaluations
         return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
 
     def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:

@@ -40,7 +40,8 @@ class Regions:
     def of(looks: Float[Tensor, "n 4"], is_object: Bool[Tensor, "n"]) -> "Regions":
         """From pixels that are thought to be the object's, and others. Without one of them nothing is told."""
         inside, outside = (_histogram(looks[some]) + PRIOR for some in (is_object, ~is_object))
-        return Regions(inside / (inside + outside))
+        told = inside / (inside + outside)
+        return Regions(told if is_object.any() and not is_object.all() else torch.full_like(told, 0.5))
 
     def probability(self, looks: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
         """That pixels of some appearance show the object."""

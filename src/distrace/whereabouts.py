@@ -18,6 +18,7 @@ from distrace.render import render
 CELLS = 64  # along each axis of the cube around the unit sphere
 CLEARLY = 0.6  # the probability from which a pixel counts: a background's is below one half
 COARSE = 96  # pixels along the longer side, of masks of typical shapes: at 48 thin legs were lost
+WIDEST = 4.0  # × larger or smaller is a mark on the object, or the background
 VIEWS = 12  # at most, of those that make hulls
 
 
@@ -25,7 +26,8 @@ def whereabouts(stage: Stage, typical: Sequence[SDF], like: Similarity) -> Simil
     """Where typical shapes must lie for their visual hulls to be as large as the object's, and in the same middle.
 
     Masks make the hull, or else looks that are rarer outside the unit sphere's image. What views leave open, as that
-    below objects seen from above, is in all hulls. The place stays turned as it was; where there is no hull, as it is.
+    below objects seen from above, is in all hulls. The place stays turned as it was; where there is no hull, or one of
+    quite another size, as it is.
     """
     masked = [
         view if view.mask is not None else replace(view, mask=likely)
@@ -38,6 +40,8 @@ def whereabouts(stage: Stage, typical: Sequence[SDF], like: Similarity) -> Simil
     if known is None or told is None:
         return like
     growth = told.radius / known.radius
+    if not 1 / WIDEST < growth < WIDEST:
+        return like
     return replace(
         like, translation=told.middle - growth * (known.middle - like.translation), scale=like.scale * growth
     )

@@ -70,7 +70,7 @@ class Multiview:
                 "unit_sphere": found.placement.described(),
                 "doubtful": [view.name for view in agreed if view.doubtful],
                 "evaluations": sum(step.evaluations for step in steps),
-                "setup_evaluations": 0,
+                "setup_evaluations": steps[0].searched,
             }
         )
 
