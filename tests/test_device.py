@@ -9,9 +9,9 @@ from pretended import DEVICE, pretended, there
 from test_train import finished, spheres
 
 import distrace.cli.console
+from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.cli import _run
-from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.data.view import View
 from distrace.fit import FitConfig

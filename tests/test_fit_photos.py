@@ -14,13 +14,13 @@ from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.doubtful import agreements
-from distrace.fit_photos import PhotoConfig, fit_photos
+from distrace.fit_photos import PhotoConfig, Search, fit_photos
 from distrace.photo_pairs import Colours, partners, without_light
 from distrace.photo_residuals import PhotoProblem, Shape
 from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import Prior
-from distrace.rays import Rays
+from distrace.rays import Rays, meet_sphere
 from distrace.regions import Regions, appearance
 from distrace.render import render
 
@@ -202,3 +202,49 @@ def test_a_view_whose_camera_is_wrong_is_told(decoder: Decoder, views: list[Phot
 def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) -> None:
     with pytest.raises(ValueError, match="1 photographs were given"):
         fit_photos(decoder, views[:1], PRIOR)
+
+
+def test_all_evaluations_are_counted(
+    decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, run = 0, Decoder._run
+
+    def counting(self: Decoder, layers: list, points: Tensor, *watch: object) -> Tensor:
+        nonlocal made
+        made += points.numel() // 3
+        return run(self, layers, points, *watch)
+
+    monkeypatch.setattr(Decoder, "_run", counting)
+    compared = replace(COMPARED, rays=300, moves=True)
+    first, *others = fit_photos(
+        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, compared=compared)
+    )
+    assert first.evaluations + sum(step.evaluations for step in others) == pytest.approx(made, rel=0.01)
+    assert 0 < first.searched < first.evaluations
+
+
+def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder, views: list[Photograph]) -> None:
+    stage, search, still = Stage.of(views, 0.5, COMPARED), Search(decoder, PRIOR), Similarity.identity()
+    for place in (replace(still, scale=torch.tensor(0.01)), replace(still, translation=torch.tensor([2.5, 0, 0]))):
+        assert search.likelier(stage, COMPARED, (place, still)) is still
+
+
+def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite(
+    decoder: Decoder, views: list[Photograph]
+) -> None:
+    shape, stage = Shape(PRIOR.coordinates(TRUE), Similarity.identity()), Stage.of(views, 0.5, COMPARED)
+    compared = replace(COMPARED, moves=True)
+    problem, look = stage.problem(decoder, PRIOR, shape, compared, torch.Generator().manual_seed(0))
+    away = problem.moved(look, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
+    rays = shape.place.rays_in_object(problem.seen.rays[problem.pairs[:, 0]])
+    assert not meet_sphere(away.shape.place.rays_in_object(rays)).meets.all(), "some leave it"
+    found = problem.residuals(away)
+    assert found.values.isfinite().all()
+    assert found.jacobian.isfinite().all()
+
+
+def test_without_object_or_background_no_colour_tells() -> None:
+    looks = appearance(torch.rand(20, 20, 3)).reshape(-1, 4)
+    for is_object in (torch.zeros(400, dtype=torch.bool), torch.ones(400, dtype=torch.bool)):
+        told = Regions.of(looks, is_object).probability(looks)
+        torch.testing.assert_close(told, torch.full_like(told, 0.5))

@@ -32,7 +32,7 @@ from distrace.primitives import box, sphere, torus
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
-from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.reconstruction_run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction_terms import MARCH, Pool, coloured, terms_of
 from distrace.registration import registered
 from distrace.render import render
@@ -277,24 +277,26 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
 
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:
-    config, names = replace(SHORT, steps=12, sizes=(16, 32)), [view.name for view in views]
+    config, marks = replace(SHORT, steps=12, sizes=(16, 32)), [mark(view) for view in views]
     whole = Reconstruction.fresh(SMALL, config, 8, CPU)
     list(reconstruct(views, whole, config))
     half = Reconstruction.fresh(SMALL, config, 8, CPU)
     for step in reconstruct(views, half, config):
         if step.step == 5:
             break
-    save_reconstruction(tmp_path, half, config, names)
-    again = load_reconstruction(tmp_path, config, SMALL, names, CPU)
+    save_reconstruction(tmp_path, half, config, marks)
+    again = load_reconstruction(tmp_path, config, SMALL, marks, CPU)
     assert again.step == 5
     list(reconstruct(views, again, config))
     for one, other in zip(whole.surface.parameters(), again.surface.parameters()):
         assert torch.equal(one, other)
     with pytest.raises(ValueError, match="other rays, width; give the same, or another --out"):
-        load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), names, CPU)
+        load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), marks, CPU)
+    with pytest.raises(ValueError, match="of a run with other photographs; give the same, or another --out"):
+        load_reconstruction(tmp_path, config, SMALL, [*marks[1:], mark(turned(views[0], 1.0))], CPU)
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
-        load_reconstruction(tmp_path, config, SMALL, names, CPU)
+        load_reconstruction(tmp_path, config, SMALL, marks, CPU)
 
 
 def test_an_object_before_a_dark_background_is_told_from_it(views: list[Photograph]) -> None:
@@ -320,6 +322,8 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
     assert [view.name for view in apart] == ["01", "05"]
     assert len(told) == 6
     assert parted(views, 0) == (views, [])
+    empty = replace(views[1], mask=torch.zeros_like(views[1].known_mask))
+    assert [view.name for view in parted([views[0], empty, *views[2:]], 4)[1]] == ["05"]
     for every in (-1, 1):
         with pytest.raises(ValueError, match=f"--held-out {every}"):
             parted(views, every)

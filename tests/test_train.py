@@ -25,6 +25,7 @@ from distrace.decoder import NetworkSpecs
 from distrace.resume import NAME, load_training, save_training
 from distrace.train import (
     Samples,
+    Step,
     TrainConfig,
     Training,
     begin_with,
@@ -34,7 +35,6 @@ from distrace.train import (
     start,
     train,
     training_loss,
-    Step,
 )
 
 CPU = torch.device("cpu")

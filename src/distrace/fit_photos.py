@@ -149,13 +149,16 @@ class Search:
         return [self.prior.start(0, self.seed), *nearest, *draws]
 
     def _loss(self, stage: Stage, compared: Comparing, shape: Shape) -> float:
-        """Of colours and outlines, on rays that are the same for all shapes; infinite where no view is contradicted
-        because none sees the shape."""
+        """Of colours and outlines, on rays that are the same for all shapes; infinite where nothing is contradicted
+        because most views do not show the shape, or no ray meets it."""
         random = torch.Generator().manual_seed(self.seed)
         problem, look = stage.problem(self.decoder, self.prior, shape, compared, random)
         terms = problem.terms(look, problem.residuals(look))
         self.evaluations += problem.evaluations
-        return terms["colour"] + terms["outline"] if look.hit.any() else math.inf
+        middle = shape.place.translation
+        showing = [view.camera.shows(*view.camera.project(middle)) for view in stage.photographs]
+        seen = look.hit.any() and 2 * sum(map(bool, showing)) >= len(showing)
+        return terms["colour"] + terms["outline"] if seen else math.inf
 
 
 def _solved(

@@ -178,9 +178,7 @@ def reconstruct(
         yield from _retouched(photographs, state, config)
 
 
-def _retouched(
-    photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig
-) -> Iterator[Step]:
+def _retouched(photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig) -> Iterator[Step]:
     """The last steps, of colours alone."""
     began, surface = time.perf_counter(), CountedSurface(state.surface)
     finest = Pool.of([each.at_most(config.sizes[-1]) for each in photographs]).pixels

@@ -6,7 +6,7 @@ Rays that are traced once serve every step, of many more pixels than a step that
 from dataclasses import dataclass, fields
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional as F
 

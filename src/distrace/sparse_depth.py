@@ -156,9 +156,11 @@ def done(place: Place, trial: Trial) -> Done:
             return Done(Trial(**kept.pop("trial")), **kept)
     steps = list(steps_of(model, observed(trial, place.meshes), trial.method, config))
     code = steps[-1].code
-    mesh = extract_mesh(model.field(code), MeshConfig(place.resolution))
-    truth = true_solid(place.meshes, trial.category, trial.shape).surface
-    distance = chamfer(mesh if len(mesh.faces) else _nothing(), truth)
+    try:
+        found = extract_mesh(model.field(code), MeshConfig(place.resolution))
+    except ValueError:  # it has no surface
+        found = _nothing()
+    distance = chamfer(found, true_solid(place.meshes, trial.category, trial.shape).surface)
     result = Done(
         trial,
         distance.to,

@@ -16,8 +16,8 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.methods import completing
 from distrace.metrics import chamfer, surface_points
 from distrace.plausible import plausible, spread
-from distrace.sparse_depth import camera_of, hash_of, true_solid
 from distrace.processes import each_done
+from distrace.sparse_depth import camera_of, hash_of, true_solid
 from distrace.trials import opened_once
 
 COMPLETIONS = 6  # whose spread is taken

@@ -139,4 +139,5 @@ def _show(rows: Sequence[dict[str, Any]]) -> None:
 
 def _finish(run: Run, rows: list[dict[str, Any]]) -> None:
     _show(rows)
-    run.finish({"rows": rows, **origin(), "evaluations": sum(row["queries"] for row in rows)})
+    evaluations, setup = (sum(row.get(name, 0) for row in rows) for name in ("queries", "setup_queries"))
+    run.finish({"rows": rows, **origin(), "evaluations": evaluations, "setup_evaluations": setup})

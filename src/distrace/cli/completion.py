@@ -69,11 +69,12 @@ class Outcome:
 
 def complete(run: Run, task: Task) -> None:
     """Fits, and writes mesh, code, pictures, page and `result.json`."""
-    outcome = _fitted(task)
-    last = outcome.steps[-1]
-    save_mesh(run.out / "mesh.ply", outcome.mesh)
+    steps = _fitted(task)
+    last = steps[-1]
     with written(run.out / "code.npy") as file:
         np.save(file, last.code.cpu().numpy())
+    outcome = _outcome(task, steps)
+    save_mesh(run.out / "mesh.ply", outcome.mesh)
     for step in outcome.others:
         mesh = extract_mesh(task.model.field(step.code), task.mesh)
         save_mesh(run.out / f"plausible-{step.start + 1}.ply", mesh)
@@ -86,15 +87,20 @@ def complete(run: Run, task: Task) -> None:
     if distances:
         console.print(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
         facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
-    run.finish({**facts, "setup_evaluations": 0})
+    run.finish(facts)
 
 
-def _fitted(task: Task) -> Outcome:
+def _fitted(task: Task) -> list[Step]:
     steps: list[Step] = []
     with progress("fitting", task.fit.total) as bar:
         for step in completing(task.model, task.known, task.fit):
             steps.append(step)
             bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+    return steps
+
+
+def _outcome(task: Task, steps: list[Step]) -> Outcome:
+    """The surface, and what else fits. Raises `ValueError` for a field without a zero."""
     others = list(_others(task))
     mesh = extract_mesh(task.model.field(steps[-1].code), task.mesh)
     if others and len(mesh.faces):

@@ -40,6 +40,8 @@ class Run:
     def finish(self, facts: dict[str, Any]) -> None:
         """Writes `result.json` and says where everything is."""
         common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
+        if "evaluations" in facts:
+            common["setup_evaluations"] = 0  # unless facts say otherwise
         save_json(self.out / "result.json", {**common, "version": version("distrace"), **facts})
         console.print(f"wrote [bold]{self.out}[/bold] in {common['seconds']:.1f} s")
 

@@ -18,9 +18,9 @@ from distrace.focal_test import look_rows, looks
 from distrace.methods import METHODS
 from distrace.multiview_table import METHODS as METHODS_OF_CLIPS
 from distrace.multiview_table import ClipTrial, clip_done, described, multiview_rows, settings_of
+from distrace.processes import each_done
 from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
 from distrace.spread_table import spread_rows
-from distrace.processes import each_done
 
 
 @dataclass(frozen=True)

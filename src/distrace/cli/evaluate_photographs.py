@@ -37,11 +37,11 @@ class Photographs:
                 rows += result["rows"]
                 evaluations += result["evaluations"]
         show_table(rows)
-        run.finish({"rows": rows, "evaluations": evaluations, "setup_evaluations": 0, **origin()})
+        run.finish({"rows": rows, "evaluations": evaluations, **origin()})
 
     def _result(self, folder: Path, method: str) -> dict:
         """What `reconstruct` leaves in a folder of its own."""
-        out = self.out / f"{folder.name}-{method}"
+        out = self.out / f"{folder.resolve().name}-{method}"
         own = {name: getattr(self, name) for name in ("steps", "sizes", "held_out", "device")}
         Reconstruct(folder, out, silhouettes_only=method == "hull", **own).run()
         return read_json(out / "result.json")

@@ -60,7 +60,9 @@ class Pose:
                 bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}, {step.off:.1%} of the rays off")
         last = steps[-1]
         if not np.isfinite(last.loss):
-            raise ValueError(f"{self.observation}: no camera was found, for the loss is {last.loss}; is its camera right?")
+            raise ValueError(
+                f"{self.observation}: no camera was found, for the loss is {last.loss}; is its camera right?"
+            )
         save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
         chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
@@ -100,7 +102,6 @@ class Pose:
             "starts": max(step.start for step in steps) + 1,
             "iterations": len(steps),
             "evaluations": last.evaluations,
-            "setup_evaluations": 0,
         }
         degrees, percent = pose_error(last.camera, observed.camera)
         focal = 100 * abs(float(last.camera.intrinsics[0, 0] / observed.camera.intrinsics[0, 0]) - 1)

@@ -19,7 +19,7 @@ from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
 from distrace.reconstruction_page import judged
-from distrace.reconstruction_run import load_reconstruction, save_reconstruction
+from distrace.reconstruction_run import load_reconstruction, mark, save_reconstruction
 from distrace.shading import save_png
 from distrace.surface_network import SurfaceSpecs
 
@@ -84,10 +84,14 @@ def without(views: Sequence[Photograph], names: Sequence[str]) -> tuple[Photogra
 
 
 def parted(views: Sequence[Photograph], every: int) -> tuple[list[Photograph], list[Photograph]]:
-    """Views to fit to, and one in so many to compare. Raises `ValueError` where fewer than two are left."""
+    """Views to fit to, and one in so many to compare, of those that show the object.
+
+    Raises `ValueError` where fewer than two are left.
+    """
     if every < 0:
         raise ValueError(f"--held-out {every} was given; one view in so many is held out, 0 for none")
     apart = set(range(every // 2 - 1, len(views), every)) if every > 1 else set()
+    apart = {number for number in apart if views[number].mask is None or views[number].known_mask.any()}
     told = [view for number, view in enumerate(views) if number not in apart]
     if every == 1 or len(told) < 2:
         raise ValueError(
@@ -105,13 +109,16 @@ def fitted(
     save_every: float,
 ) -> Reconstruction:
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
-    names = [view.name for view in views]
-    state = load_reconstruction(run.out, config, specs, names, run.device)
+    marks = [mark(view) for view in views]
+    state = load_reconstruction(run.out, config, specs, marks, run.device)
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
         console.print("carving what the masks allow, and teaching the network that")
+        for preview in (run.out / "previews").glob("*.png"):
+            preview.unlink()  # of a run whose checkpoint was moved away
         begin_with_hull(state, views, config)
+    names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     saved, due = time.perf_counter(), -(-config.total // PREVIEWS)
     with progress("reconstructing", config.total) as bar:
@@ -121,9 +128,9 @@ def fitted(
                 small = judged(state, shown, PREVIEWED)
                 save_png(run.out / "previews" / f"{step.step:07d}.png", small.picture)
             if time.perf_counter() - saved > save_every:
-                save_reconstruction(run.out, state, config, names)
+                save_reconstruction(run.out, state, config, marks)
                 saved = time.perf_counter()
-    save_reconstruction(run.out, state, config, names)
+    save_reconstruction(run.out, state, config, marks)
     return state
 
 

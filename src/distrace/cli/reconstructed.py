@@ -58,7 +58,6 @@ class Reconstructed:
                 "cameras": self._cameras(),
                 "steps": self.state.step,
                 "evaluations": self.state.evaluations,
-                "setup_evaluations": 0,
             }
         )
         for row in rows:

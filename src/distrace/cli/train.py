@@ -109,7 +109,9 @@ class Train:
                     f"{option} {value} was given, but the run in {self.out} has {has[name]}; give that, or another --out"
                 )
         if self.steps is not None and self.steps < training.step:
-            raise ValueError(f"--steps {self.steps} was given, but the run in {self.out} has done {training.step} already")
+            raise ValueError(
+                f"--steps {self.steps} was given, but the run in {self.out} has done {training.step} already"
+            )
 
 
 def _said(command: Train, *names: str) -> dict[str, Any]:

@@ -48,7 +48,9 @@ def masked(photographs: Photographs) -> Photographs:
     )
     empty = [view.name for view in found if not view.known_mask.any()]
     if 2 * len(empty) > len(found):
-        raise ValueError(f"in {len(empty)} of {len(found)} views, as {empty[0]}, nothing stands out from the dark; give masks")
+        raise ValueError(
+            f"in {len(empty)} of {len(found)} views, as {empty[0]}, nothing stands out from the dark; give masks"
+        )
     return replace(photographs, views=found) if photographs.told else _placed_again(replace(photographs, views=found))
 
 
@@ -64,7 +66,9 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
     bright = colours.max(-1)
     if bright.max() - bright.min() < NOISE:
-        raise ValueError(f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks")
+        raise ValueError(
+            f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks"
+        )
     dark = colours[bright < threshold_li(bright)]
     mean, whiten = dark.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
     apart = _apart(colours, mean, whiten)

@@ -106,5 +106,7 @@ def _earlier(job: Job) -> Doubt | None:
         report = Doubt(**kept)
     others = [name for name, value in now.items() if before.get(name) != value]
     if others:
-        raise ValueError(f"{job.out} has samples of {job.shape.name} with another {', '.join(others)}; give another --out")
+        raise ValueError(
+            f"{job.out} has samples of {job.shape.name} with another {', '.join(others)}; give another --out"
+        )
     return report if job.samples().exists() or not report.usable else None
