@@ -84,5 +84,5 @@ def test_masks_that_are_given_stay_and_so_does_a_unit_sphere_that_was_told() -> 
 def test_black_images_end_in_one_sentence() -> None:
     given = around()
     black = [replace(view, image=torch.zeros_like(view.image), mask=None) for view in given.views]
-    with pytest.raises(ValueError, match="all 4 images have one brightness, 0.00: nothing stands out; give masks"):
+    with pytest.raises(ValueError, match=r"all 4 images have one brightness, 0.00: nothing stands out; give masks"):
         masked(replace(given, views=tuple(black)))

@@ -191,6 +191,6 @@ def test_a_field_that_gives_something_else_than_distances_is_told(name: str) -> 
         lambda: extract_mesh(WRONG[name], MeshConfig(16)),
     ):
         with pytest.raises(
-            ValueError, match="the field gave .*; one distance for each is needed, torch.float32 of shape"
+            ValueError, match=r"the field gave .*; one distance for each is needed, torch.float32 of shape"
         ):
             ask()

@@ -235,7 +235,7 @@ def test_samples_of_another_mesh_or_other_settings_are_not_taken_for_these(
         list(sampling.run([replace(job, mesh=folder / "meshes" / "corner.ply")], workers=1))
     damaged = replace(job, out=tmp_path)
     damaged.report.write_text("[]")
-    with pytest.raises(ValueError, match="cube.json is not what `sample` leaves of a shape; remove it"):
+    with pytest.raises(ValueError, match=r"cube.json is not what `sample` leaves of a shape; remove it"):
         list(sampling.run([damaged], workers=1))
 
 

@@ -75,8 +75,8 @@ def fit_photos(
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
     place: that given or, if it is unknown and they contradict it less there, where the photographs tell; the one whose
-    loss falls lowest goes on. On the CPU alone. Raises `ValueError` for fewer than two photographs, and for a decoder on
-    another device.
+    loss falls lowest goes on. On the CPU alone. Raises `ValueError` for fewer than two photographs, and for a decoder
+    on another device.
     """
     if prior.mean.device.type != "cpu":
         raise ValueError(f"the decoder is on {prior.mean.device}; photographs are fitted on the CPU: move it there")
@@ -133,7 +133,7 @@ class Search:
         return min(places, key=lambda place: median(self._loss(stage, few, Shape(w, place)) for w in shapes))
 
     def ranked(self, stage: Stage, compared: Comparing, place: Similarity) -> list[tuple[float, torch.Tensor]]:
-        """The losses and coordinates of the best training shapes, the least loss first; of all of them, on fewer rays."""
+        """The losses and coordinates of the best training shapes, the least first; of all of them, on fewer rays."""
         codes = [self.prior.coordinates(code) for code in self.prior.codes]
         for rays in (min(SCREENED, compared.rays), compared.rays):
             losses = [self._loss(stage, replace(compared, rays=rays), Shape(w, place)) for w in codes]

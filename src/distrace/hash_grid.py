@@ -37,7 +37,7 @@ class GridSpecs:
 
 
 class HashGrid(nn.Module):
-    """Points of the cube [−1, 1]³ → `levels` × `channels` values, between corners linearly; beyond it those of its sides."""
+    """Points of [−1, 1]³ → `levels` × `channels` values, linear between corners; beyond, those of the sides."""
 
     corners: Int[Tensor, "8 3"]
 

@@ -88,7 +88,7 @@ class Pose:
             return around.T_world_camera.to(camera.T_world_camera)
         if (elevation, distance) != (None, None):
             raise ValueError(
-                f"--elevation {elevation} --distance {distance} were given without --azimuth; together they place the camera"
+                f"--elevation {elevation} --distance {distance} were given without --azimuth; together they place it"
             )
         return camera.T_world_camera
 

@@ -106,7 +106,7 @@ class Train:
             if value != has[name]:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(
-                    f"{option} {value} was given, but the run in {self.out} has {has[name]}; give that, or another --out"
+                    f"{option} {value} was given, but the run in {self.out} has {has[name]}; give another --out"
                 )
         if self.steps is not None and self.steps < training.step:
             raise ValueError(
@@ -158,8 +158,8 @@ def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, sa
         for step in run_training(samples, training, config):
             if not math.isfinite(step.loss):
                 raise ValueError(
-                    f"the training has diverged at step {step.step}; {run.out} has what was saved before. Let wrong signs"
-                    " and large errors count less, or look for samples that are far off"
+                    f"the training has diverged at step {step.step}; {run.out} has what was saved before. Let wrong"
+                    " signs and large errors count less, or look for samples that are far off"
                 )
             loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
