@@ -259,6 +259,12 @@ def test_the_prior_has_the_mean_and_the_covariance_of_the_codes_and_a_little_in_
     assert torch.equal(prior.code(torch.zeros(4)), prior.mean)
 
 
+def test_codes_that_are_all_the_same_leave_deepsdfs_prior_about_them() -> None:
+    prior = prior_of(torch.full((3, 4), 0.2))
+    torch.testing.assert_close(prior.basis, 0.1 * torch.eye(4))
+    torch.testing.assert_close(prior.coordinates(torch.full((4,), 0.2)), torch.zeros(4))
+
+
 def test_directions_in_which_no_code_varies_stay_open_and_one_code_has_the_prior_of_deepsdf() -> None:
     codes = torch.zeros(5, 4)
     codes[:, 1] = torch.arange(5.0)

@@ -18,7 +18,7 @@ from distrace.point_residuals import PointProblem, misfit
 from distrace.prior import Prior
 from distrace.render import render
 from distrace.solver import SolverConfig, minimise
-from distrace.starts import Step
+from distrace.starts import Step, stages_of
 from distrace.targets import Pool
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
@@ -175,7 +175,9 @@ def test_the_end_that_contradicts_the_view_least_is_the_result(decoder: Decoder,
 def test_a_fit_of_few_iterations_ends_with_the_best_start(decoder: Decoder, view: View, iterations: int) -> None:
     steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=iterations, starts=2, trial=9)))
     assert steps[-1].iteration == iterations
-    assert sum(replace(CONFIG, iterations=iterations).stage_lengths) == iterations
+    stages = stages_of(iterations, CONFIG.stages)
+    assert sum(length for _, length in stages) == iterations
+    assert stages[-1][0] == CONFIG.stages - 1, "the robust one is never left out"
 
 
 def test_the_solver_lowers_its_loss(decoder: Decoder, view: View) -> None:

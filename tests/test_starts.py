@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from distrace.starts import Starts, Step, best_of
+from distrace.starts import Starts, Step, best_of, stages_of
 
 
 def run(losses: list[list[float]], starts: Starts, recent: int = 8) -> list[tuple[int, int, float]]:
@@ -73,3 +73,9 @@ def test_a_single_start_is_not_tried() -> None:
 )
 def test_a_plan_says_what_it_does(starts: Starts, said: str) -> None:
     assert str(starts) == said
+
+
+def test_stages_share_the_iterations_and_the_last_one_has_some() -> None:
+    assert stages_of(16, 4) == [(0, 4), (1, 4), (2, 4), (3, 4)]
+    assert stages_of(4, 6) == [(1, 1), (2, 1), (4, 1), (5, 1)]
+    assert stages_of(1, 4) == [(3, 1)]

@@ -1,5 +1,6 @@
 """Views that do not agree with the others about a shape that was fitted to all: most often their cameras are wrong."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import median
@@ -21,7 +22,7 @@ NOTICEABLE = 0.03  # … if its colours, from 0 to 1, are off by that, too
 
 @dataclass(frozen=True)
 class Agreement:
-    """The median difference of a view's colours, from 0 to 1, to those of the same points in others."""
+    """The median difference of a view's colours, from 0 to 1, to those of the same points in others; NaN of none."""
 
     name: str
     colour: float
@@ -37,9 +38,9 @@ def agreements(
     between, doubtful = _between(problem, look, len(photographs)), set[int]()
     while True:
         off = {view: _median(between[view], doubtful | {view}) for view in range(len(photographs))}
-        left = {view: value for view, value in off.items() if view not in doubtful}
-        worst = max(left, key=lambda view: left[view])
-        if left[worst] <= max(FAR_OFF * median(left.values()), NOTICEABLE) or len(left) < 3:
+        left = {view: value for view, value in off.items() if view not in doubtful and math.isfinite(value)}
+        worst = max(left, key=lambda view: left[view], default=-1)
+        if len(left) < 3 or left[worst] <= max(FAR_OFF * median(left.values()), NOTICEABLE):
             return [Agreement(each.name, off[view], view in doubtful) for view, each in enumerate(photographs)]
         doubtful.add(worst)
 
@@ -58,6 +59,6 @@ def _between(problem: PhotoProblem, look: Look, count: int) -> Float[Tensor, "vi
 
 
 def _median(row: Float[Tensor, "views"], left_out: set[int]) -> float:
-    """Of those that are not left out; zero where none is known."""
+    """Of those that are not left out; NaN where none is known."""
     known = [float(value) for view, value in enumerate(row) if view not in left_out and value.isfinite()]
-    return median(known or [0.0])
+    return median(known or [math.nan])

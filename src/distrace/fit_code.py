@@ -3,7 +3,6 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from typing import Any
 
 import torch
@@ -17,10 +16,11 @@ from distrace.field import SDF, Counted
 from distrace.fit import pools_of
 from distrace.losses import Weights
 from distrace.nearest import DEPTHS, SILHOUETTE, Hints, first_of
-from distrace.point_residuals import LOOKED, PointProblem, drawn, misfit
+from distrace.point_residuals import LOOKED, PointProblem, misfit
 from distrace.prior import Prior
 from distrace.solver import Kernel, SolverConfig, cauchy, charbonnier, minimise
-from distrace.starts import Starts, Step, best_of
+from distrace.starts import Starts, Step, best_of, stages_of
+from distrace.targets import drawn
 from distrace.verdict import contradiction
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
@@ -56,11 +56,6 @@ class CodeFitConfig(Starts):
         if stage >= self.stages - self.robust:
             return self.outlying, cauchy
         return self.scale * self.narrowing**stage, charbonnier
-
-    @property
-    def stage_lengths(self) -> list[int]:
-        ends = [self.iterations * stage // self.stages for stage in range(self.stages + 1)]
-        return [end - begin for begin, end in pairwise(ends) if end > begin]
 
 
 def fit_code(
@@ -147,8 +142,8 @@ def _solved(
     random = torch.Generator().manual_seed(config.seed)
     problem: Any = None
     state = None
-    for stage, length in enumerate(config.stage_lengths):
-        if stage < 2:
+    for stage, length in stages_of(config.iterations, config.stages):
+        if problem is None or stage < 2:
             problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
         problem.scale, kernel = config.scale_and_kernel(stage)
         state = problem.look(w, state)

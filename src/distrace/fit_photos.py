@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
 from statistics import median
 
 import torch
@@ -21,7 +20,7 @@ from distrace.photo_stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.solver import SolverConfig, charbonnier, minimise
-from distrace.starts import Starts, Step, best_of
+from distrace.starts import Starts, Step, best_of, stages_of
 from distrace.whereabouts import whereabouts
 
 SCREENED = 400  # rays on which all training shapes are compared, …
@@ -48,12 +47,6 @@ class PhotoConfig(Starts):
         super().__post_init__()
         if not self.levels or not all(0 < level <= 1 for level in self.levels):
             raise ValueError(f"levels {self.levels} were given; each is a part of the images' size, up to 1")
-
-    @property
-    def stage_lengths(self) -> list[int]:
-        count = len(self.levels)
-        ends = [self.iterations * stage // count for stage in range(count + 1)]
-        return [end - begin for begin, end in pairwise(ends)]
 
 
 @dataclass(frozen=True)
@@ -166,7 +159,8 @@ def _solved(
 ) -> Iterator[PhotoStep]:
     began, done, damping, expected = time.perf_counter(), 0, config.damping, shape.place
     random = torch.Generator().manual_seed(config.seed)
-    for number, (stage, length) in enumerate(zip(stages, config.stage_lengths, strict=True)):
+    for number, length in stages_of(config.iterations, len(stages)):
+        stage = stages[number]
         problem, look = stage.problem(decoder, prior, shape, config.compared, random)
         problem.expected = expected
         problem.scale, evaluations = config.scale * config.narrowing**number, 0

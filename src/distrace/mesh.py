@@ -9,8 +9,9 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from distrace.field import SDF, asked, narrowed
+from distrace.field import SDF, asked, chunked, narrowed
 
+AT_ONCE = 1 << 16  # points, of a field that does not limit them itself
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
 
 
@@ -35,7 +36,7 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     Normals point out. Raises `ValueError` where the field has no zero in the cube.
     """
     width = 2 * config.radius / config.resolution
-    cells, near = _cells_at_surface(sdf, config)
+    cells, near = _cells_at_surface(sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE), config)
     corners = _corners(cells)
     points = corners.float() * width - config.radius
     found = near(points)

@@ -12,6 +12,7 @@ from distrace.field import SDF
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.solver import Residuals
+from distrace.targets import drawn
 
 LOOKED = 20_000  # points at most that are asked whether they say something
 
@@ -69,11 +70,6 @@ class PointProblem:
             "distance": self.counted.depth * float(distance),
             "code": self.counted.code * float(at.w.square().mean()),
         }
-
-
-def drawn(samples: Float[Tensor, "n 4"], count: int, random: torch.Generator) -> Float[Tensor, "m 4"]:
-    """So many of them, or all if they are fewer, in random order."""
-    return samples[torch.randperm(len(samples), generator=random)[:count]]
 
 
 @torch.no_grad()

@@ -33,14 +33,14 @@ class Prior:
 
 
 def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:
-    """The Gaussian of some training codes; of fewer than two, DeepSDF's N(0, 0.1²).
+    """The Gaussian of some training codes; of fewer than two that differ, DeepSDF's N(0, 0.1²) about them.
 
     Directions in which the training codes hardly differ keep a small deviation: shapes not trained on need them.
     """
     length = codes.shape[1]
-    if len(codes) < 2:
-        return Prior(codes.new_zeros(length), 0.1 * torch.eye(length, device=codes.device), tuple(codes))
-    mean = codes.mean(0)
+    mean = codes.mean(0) if len(codes) > 1 else codes.new_zeros(length)
+    if (codes == codes[:1]).all():
+        return Prior(mean, 0.1 * torch.eye(length, device=codes.device), tuple(codes))
     _, found, directions = torch.linalg.svd((codes - mean) / math.sqrt(len(codes) - 1))
     deviations = codes.new_zeros(length)
     deviations[: len(found)] = found

@@ -25,6 +25,7 @@ from distrace.render import Buffers, render
 from distrace.scene import scene
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 
+AT_ONCE = 1 << 16  # points whose colours are asked for
 FINER = 2  # rays across a pixel: photographs have means over areas
 
 
@@ -66,7 +67,9 @@ def seen(
     camera = view.camera.resized(float(FINER)).to(state.surface.last.weight.device)
     buffers = render(state.surface, camera)
     made = torch.zeros_like(buffers.rays.directions)
-    made[buffers.mask] = coloured(state.surface, state.colour, buffers.points, buffers.rays.directions[buffers.mask])
+    hits = zip(buffers.points.split(AT_ONCE), buffers.rays.directions[buffers.mask].split(AT_ONCE), strict=True)
+    parts = [coloured(state.surface, state.colour, *some) for some in hits]
+    made[buffers.mask] = torch.cat(parts) if parts else made[:0, 0]
     covered = averaged(buffers.mask[..., None].cpu().float(), 1 / FINER)[..., 0]
     return buffers, covered > 0.5, averaged(made.cpu(), 1 / FINER).float()
 
@@ -77,7 +80,7 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
     mesh = extract_mesh(state.surface, config)
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float().to(config.device)
     parts = []
-    for points in vertices.split(1 << 16):
+    for points in vertices.split(AT_ONCE):
         _, gradient = value_and_gradient(state.surface, points)
         parts.append(coloured(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
     colours = (255 * torch.cat(parts)).round().byte().cpu().numpy()

@@ -106,7 +106,7 @@ def common_loss(model: Model, view: View, prior: Prior) -> Loss:
 
     @torch.no_grad()
     def loss(code: Float[Tensor, "length"]) -> float:
-        w = torch.linalg.solve(prior.basis, code - prior.mean)
+        w = prior.coordinates(code)
         terms = view_terms(model.field(code), [targets], ADAM)
         return float(torch.stack(list(terms.values())).sum() + ADAM.weights.code * w.square().mean())
 

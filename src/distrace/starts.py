@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 from typing import TypeVar
 
 from jaxtyping import Float
@@ -57,6 +57,12 @@ class Step:
     code: Float[Tensor, "length"]
     seconds: float
     evaluations: int = 0  # of the field
+
+
+def stages_of(iterations: int, count: int) -> list[tuple[int, int]]:
+    """The numbers of stages, and how many of the iterations each has; those that would have none are left out."""
+    ends = [iterations * stage // count for stage in range(count + 1)]
+    return [(stage, end - begin) for stage, (begin, end) in enumerate(pairwise(ends)) if end > begin]
 
 
 Stepped = TypeVar("Stepped", bound=Step)

@@ -32,8 +32,8 @@ class Complete:
     out: Path = Path("out/complete")
     reference: Path | None = None  # the true surface, to measure against: a mesh or points (PLY)
     points: int | None = None  # use only so many of the depths or points, drawn at random
-    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts of the observation to leave out
-    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or the original's Adam; points have no other than lm
+    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts to leave out; a view's normals tell adam alone
+    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or Adam as in the original; points have lm alone
     iterations: int | None = None  # by default 16 of Levenberg–Marquardt, or 150 of Adam
     starts: int = FitConfig.starts
     plausible: int = 0  # so many other completions that fit, too, and how far they are apart
@@ -53,7 +53,7 @@ class Complete:
             raise ValueError(f"{given} were given; one cannot be negative, and at least one point is needed")
         full = load_cloud(self.observation) if cloud else load_view(self.observation)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
-        if isinstance(known, View) and not (known.seen.any() or (known.mask is not None and known.mask.any())):
+        if isinstance(known, View) and not (known if chosen is FitConfig else known.without("normal")).observed.any():
             left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
             raise ValueError(f"{self.observation}{left} has no depth and no mask of the object to complete it from")
         truth = None if self.reference is None else _reference(self.reference)

@@ -26,7 +26,7 @@ from distrace.views_page import forming, views_page
 
 @dataclass(frozen=True)
 class Multiview:
-    """Find a shape, and where it lies, from photographs with known cameras: no depth, no masks."""
+    """Find a shape, and where it lies, from photographs with known cameras: no depth, and no masks but where given."""
 
     model: tyro.conf.Positional[ModelName]
     views: tyro.conf.Positional[Views]
@@ -34,7 +34,8 @@ class Multiview:
     starts: int = PhotoConfig.starts
     fixed: Flag = False  # the shape lies in the unit sphere as the model's shapes do; only its code is unknown
     changing_light: Flag = False  # compare colours without their local brightness and contrast
-    ignore_masks: Flag = False
+    ignore_masks: Flag = False  # as if no photograph had one
+    size: int = 1024  # pixels along the longer side; larger photographs are made smaller
     rays: int = Comparing.rays  # of all views, in each stage
     resolution: int = 256  # of the mesh
     seed: int = 0
@@ -45,7 +46,10 @@ class Multiview:
         console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}", markup=False)
         for note in notes(found):
             console.print(note, markup=False)
-        views = [replace(view, mask=None) for view in found.views] if self.ignore_masks else list(found.views)
+        if self.size < 8:
+            raise ValueError(f"--size {self.size} was given; at least 8 pixels are needed")
+        views = [view.at_most(self.size) for view in found.views]
+        views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
         compared = Comparing(rays=self.rays, moves=not self.fixed, same_light=not self.changing_light)
         config = PhotoConfig(starts=self.starts, seed=self.seed, compared=compared)
         steps = _fitted(model, views, config)

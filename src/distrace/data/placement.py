@@ -13,7 +13,7 @@ from distrace.camera import Camera
 FEWEST = 20  # points that tell where an object is
 SHARE = 0.9  # of the points that lie within; the others are background and outliers
 MARGIN = 1.1
-MOST = 1e30  # of a number that tells where the sphere is
+MOST = 1e30  # of a number that tells where something is
 PARALLEL = 1e-4  # of what the information on the worst known direction would be from all sides
 TELL = "tell where the object is as unit_sphere in views.json"
 

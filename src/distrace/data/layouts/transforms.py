@@ -8,6 +8,7 @@ import numpy as np
 
 from distrace.data.layouts.shots import SUFFIXES, Shot, Shots, file_of, listed, matrix, read_json
 from distrace.data.pictures import picture_size
+from distrace.data.placement import MOST
 from distrace.errors import about
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -79,6 +80,6 @@ def _positive(entry: dict[str, Any], name: str, below: float) -> float:
 
 def _number(entry: dict[str, Any], name: str) -> float:
     value = entry[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST:
         raise ValueError(f"{name} is {value!r}; a number is needed")
     return float(value)
