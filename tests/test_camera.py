@@ -197,8 +197,8 @@ def test_a_focal_length_in_pixels_is_the_one_in_millimetres() -> None:
     ("given", "repeated"),
     [
         (dict(distance=0), "its own place"),
-        (dict(distance=math.nan), "place"),
-        (dict(distance=math.inf), "not finite"),
+        (dict(distance=math.nan), "all three must be finite"),
+        (dict(distance=math.inf), "all three must be finite"),
         (dict(height=0), "0 × 512"),
         (dict(width=-3), "512 × -3"),
         (dict(focal_mm=-35), "-35"),
@@ -244,3 +244,12 @@ def test_matrices_that_are_no_cameras_are_refused_in_words(
 def test_an_image_without_pixels_is_refused() -> None:
     with pytest.raises(ValueError, match="0 × 64"):
         Camera.from_matrices(K, T, 0, 64)
+
+
+def test_numbers_that_make_no_camera_are_told() -> None:
+    for where in ((math.inf, 0, 3), (0, math.nan, 3), (0, 0, math.inf)):
+        with pytest.raises(ValueError, match="an orbit at .* was given; all three must be finite"):
+            Camera.orbit(*where)
+    for factor in (0.0, -1.0, math.nan):
+        with pytest.raises(ValueError, match="a sensor is resized by a positive one"):
+            Camera.orbit(0, 0, 3).resized(factor)

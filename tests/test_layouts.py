@@ -307,7 +307,7 @@ LINES = {
     "no image": (replaced("view1", "none"), ("line 3", "imgname names none.png")),
     "outside": (replaced("view1", "../view1"), ("line 3", "imgname", "leaves")),
     "a word": (replaced(" 31 ", " x "), ("line 3",)),
-    "too few": (replaced(" 31 ", " "), ("line 3", "20 numbers, not by 21")),
+    "too few": (replaced(" 31 ", " "), ("line 3", "20 words; 21 numbers are needed")),
     "NaN": (replaced(" 31 ", " nan "), ("line 3", "not finite")),
 }
 

@@ -156,3 +156,10 @@ def test_vertices_that_are_not_finite_are_refused(tmp_path: Path) -> None:
     path.write_text("OFF\n3 1 0\n0 0 0\nnan 0 0\n0 1 0\n3 0 1 2\n")
     with pytest.raises(ValueError, match="not finite"):
         load_solid(path)
+
+
+def test_a_mesh_without_area_ends_in_one_sentence(tmp_path: Path) -> None:
+    for name, corners in (("line", [[0, 0, 0], [1, 0, 0], [2, 0, 0]]), ("point", [[1, 1, 1]] * 3)):
+        trimesh.Trimesh(corners, [[0, 1, 2]], process=False).export(tmp_path / f"{name}.ply")
+        with pytest.raises(ValueError, match=rf"{name}.ply cannot be read as a triangle mesh.*none of its faces has"):
+            load_solid(tmp_path / f"{name}.ply")

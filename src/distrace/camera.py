@@ -55,6 +55,8 @@ class Camera:
             given = focal_mm if focal_px is None else focal_px
             raise ValueError(f"a focal length of {given} on a sensor of {sensor_mm} was given; both must be positive")
         forward = target - eye
+        if not torch.isfinite(forward).all():
+            raise ValueError(f"a camera at {eye.tolist()} that looks at {target.tolist()} was given; both must be finite")
         if not forward.norm() > 0:
             raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
         forward = forward / forward.norm()
@@ -80,7 +82,12 @@ class Camera:
         focal_px: float | None = None,
         dtype: torch.dtype = torch.float32,
     ) -> "Camera":
-        """A camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el), in degrees."""
+        """A camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el), in degrees.
+
+        Raises `ValueError` for numbers that are not finite, and as `look_at` does.
+        """
+        if not all(map(math.isfinite, (azimuth, elevation, distance))):
+            raise ValueError(f"an orbit at {azimuth}°, {elevation}°, {distance} was given; all three must be finite")
         az, el = math.radians(azimuth), math.radians(elevation)
         eye = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
         return Camera.look_at(
@@ -139,7 +146,12 @@ class Camera:
         return least_depth * self.cosines() ** 2 / (2 * focal)
 
     def resized(self, factor: float) -> "Camera":
-        """The same camera with a coarser or finer sensor; sizes are rounded up, so that every pixel stays covered."""
+        """The same camera with a coarser or finer sensor; sizes are rounded up, so that every pixel stays covered.
+
+        Raises `ValueError` for a factor that is not positive.
+        """
+        if not 0 < factor < math.inf:
+            raise ValueError(f"a factor of {factor} was given; a sensor is resized by a positive one")
         scale = self.intrinsics.new_tensor([[factor], [factor], [1.0]])
         size = math.ceil(self.height * factor), math.ceil(self.width * factor)
         return replace(self, intrinsics=self.intrinsics * scale, height=size[0], width=size[1])

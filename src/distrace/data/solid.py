@@ -99,6 +99,8 @@ def normalised(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     middle, scale = normalised_frame(mesh)
     scaled = trimesh.Trimesh((mesh.vertices - middle) * scale, mesh.faces, process=False)
     scaled.update_faces(scaled.area_faces > 1e-14)
+    if not len(scaled.faces):
+        raise ValueError("none of its faces has an area")
     return scaled
 
 
@@ -108,7 +110,7 @@ def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
     if not len(used) or not np.isfinite(used).all():
         raise ValueError("the mesh has no faces, or vertices that are not finite")
     middle = (used.min(0) + used.max(0)) / 2
-    return middle, RADIUS / np.linalg.norm(used - middle, axis=1).max()
+    return middle, RADIUS / max(np.linalg.norm(used - middle, axis=1).max(), np.finfo(np.float64).tiny)
 
 
 def first_met(

@@ -42,7 +42,7 @@ class Shots:
 def read_json(path: Path) -> dict[str, Any]:
     """Raises `ValueError` for a file that is no JSON, or no object."""
     with explained(f"{path} cannot be read as JSON"):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors write a mark first
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds a {type(content).__name__}; an object with names is needed")
     return content
