@@ -248,7 +248,7 @@ def test_an_image_without_pixels_is_refused() -> None:
 
 def test_numbers_that_make_no_camera_are_told() -> None:
     for where in ((math.inf, 0, 3), (0, math.nan, 3), (0, 0, math.inf)):
-        with pytest.raises(ValueError, match="an orbit at .* was given; all three must be finite"):
+        with pytest.raises(ValueError, match=r"an orbit at .* was given; all three must be finite"):
             Camera.orbit(*where)
     for factor in (0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match="a sensor is resized by a positive one"):

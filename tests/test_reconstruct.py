@@ -27,7 +27,7 @@ from distrace.field import SDF, value_and_gradient
 from distrace.hash_grid import GridSpecs, HashGrid
 from distrace.hull import overlaps, visual_hull
 from distrace.matching import Matching
-from distrace.motions import drift, motions, moved, relative
+from distrace.motions import between, drift, motions, moved, relative
 from distrace.primitives import box, sphere, torus
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
@@ -164,6 +164,15 @@ def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]
     again = pool.moved(motions(nudge))
     assert torch.allclose(again.rays.origins[0], there.rays.origins[0], atol=1e-6)
     assert torch.allclose(again.rays.directions.mean(0), there.rays.directions.mean(0), atol=1e-2)
+
+
+def test_a_camera_between_two_moves_as_they_do() -> None:
+    eyes = 3 * F.normalize(torch.tensor([[1.0, 0, 0], [1.0, 0, 1.0], [-1.0, 0, 0]]), dim=-1)
+    steps = torch.arange(18.0).reshape(3, 6)
+    halfway = F.normalize(F.normalize(eyes[:2], dim=-1).sum(0), dim=0)
+    torch.testing.assert_close(between(steps, eyes, halfway), steps[:2].mean(0))
+    torch.testing.assert_close(between(steps, eyes, 2 * eyes[2]), steps[2], atol=1e-3, rtol=0)
+    torch.testing.assert_close(between(steps[:1], eyes[:1], eyes[2]), steps[0])
 
 
 def test_a_disturbed_camera_is_found_again(views: list[Photograph], fitted: Reconstruction) -> None:
@@ -340,6 +349,7 @@ def test_the_command_writes_a_mesh_in_the_folders_world(views: list[Photograph],
     result = json.loads((out / "result.json").read_text())
     assert result["rows"][0]["views_held_out"] == 2
     assert result["rows"][0]["method"] == "ours"
+    assert {"psnr", "psnr_corrected", "psnr_aligned"} <= result["rows"][0].keys()
     mesh = trimesh.load(out / "mesh.ply")
     assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)
     assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1

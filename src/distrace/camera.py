@@ -56,7 +56,7 @@ class Camera:
             raise ValueError(f"a focal length of {given} on a sensor of {sensor_mm} was given; both must be positive")
         forward = target - eye
         if not torch.isfinite(forward).all():
-            raise ValueError(f"a camera at {eye.tolist()} that looks at {target.tolist()} was given; both must be finite")
+            raise ValueError(f"a camera at {eye.tolist()}, looking at {target.tolist()}, is not finite")
         if not forward.norm() > 0:
             raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
         forward = forward / forward.norm()

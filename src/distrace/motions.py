@@ -6,6 +6,7 @@ import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import cosine_similarity
 
 from distrace.data.photograph import Photograph
 
@@ -20,6 +21,17 @@ def motions(steps: Float[Tensor, "views 6"]) -> Float[Tensor, "views 4 4"]:
 def relative(steps: Float[Tensor, "views 6"]) -> Float[Tensor, "views 6"]:
     """Without what all of them share: that would move the object, and leave other views behind."""
     return steps - steps.mean(0)
+
+
+def between(
+    steps: Float[Tensor, "views 6"], eyes: Float[Tensor, "views 3"], eye: Float[Tensor, "3"]
+) -> Float[Tensor, "6"]:
+    """The step of one more camera, as the two nearest have theirs, by angles about the middle of the unit sphere: what
+    a gantry or a turntable is off by changes little from view to view."""
+    apart = torch.acos(cosine_similarity(eyes, eye, dim=-1).clamp(-1, 1))
+    nearest, rows = apart.topk(min(2, len(eyes)), largest=False)
+    shares = 1 / nearest.clamp_min(1e-6)
+    return (shares / shares.sum()) @ steps[rows]
 
 
 def moved(photograph: Photograph, motion: Float[Tensor, "4 4"]) -> Photograph:

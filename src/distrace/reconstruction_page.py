@@ -87,21 +87,15 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def row_of(
-    name: str, method: str, views: Sequence[Judged], aligned: Sequence[Judged], seconds: float
-) -> dict[str, object]:
-    """A row of the table of photographs: means over views that were held out, and over the same with cameras that were
-    brought to agree (`registered`)."""
-    return {
-        "object": name,
-        "method": method,
-        "psnr": round(mean(view.psnr for view in views), 2),
-        "silhouette_iou": round(mean(view.silhouette_iou for view in views), 4),
-        "psnr_aligned": round(mean(view.psnr for view in aligned), 2),
-        "silhouette_iou_aligned": round(mean(view.silhouette_iou for view in aligned), 4),
-        "views_held_out": len(views),
-        "seconds": round(seconds),
-    }
+def row_of(name: str, method: str, judgements: Mapping[str, Sequence[Judged]], seconds: float) -> dict[str, object]:
+    """A row of the table of photographs: means over views that were held out, for each of some cameras; what these are
+    called follows the names of the numbers."""
+    numbers: dict[str, object] = {}
+    for cameras, views in judgements.items():
+        numbers[f"psnr{cameras}"] = round(mean(view.psnr for view in views), 2)
+        numbers[f"silhouette_iou{cameras}"] = round(mean(view.silhouette_iou for view in views), 4)
+    count = len(next(iter(judgements.values())))
+    return {"object": name, "method": method, **numbers, "views_held_out": count, "seconds": round(seconds)}
 
 
 def reconstruction_page(

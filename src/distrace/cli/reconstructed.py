@@ -17,7 +17,7 @@ from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
 from distrace.mesh import MeshConfig
-from distrace.motions import drift, moved
+from distrace.motions import between, drift, motions, moved, relative
 from distrace.movie import save_gif
 from distrace.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
@@ -63,6 +63,7 @@ class Reconstructed:
         for row in rows:
             console.print(
                 f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}; with their cameras"
+                f" corrected as their neighbours' were {row['psnr_corrected']} dB, {row['silhouette_iou_corrected']};"
                 f" registered {row['psnr_aligned']} dB, {row['silhouette_iou_aligned']}"
             )
 
@@ -83,9 +84,20 @@ class Reconstructed:
     def _rows(self, held_out: Sequence[Judged]) -> list[dict[str, object]]:
         if not held_out:
             return []
-        aligned = self._judged([registered(self.state, view, self.config) for view in self.kept_back])
+        judgements = {
+            "": held_out,
+            "_corrected": self._judged([self._corrected(view) for view in self.kept_back]),
+            "_aligned": self._judged([registered(self.state, view, self.config) for view in self.kept_back]),
+        }
         method = "ours" if self.config.colours_shape else "hull"
-        return [row_of(self.name, method, held_out, aligned, self.state.seconds)]
+        return [row_of(self.name, method, judgements, self.state.seconds)]
+
+    def _corrected(self, view: Photograph) -> Photograph:
+        """With its camera moved as those of its neighbours were; nothing of the photograph is looked at."""
+        steps = relative(self.state.steps_of_views.detach().cpu())
+        eyes = torch.stack([each.camera.T_world_camera[:3, 3] for each in self.told])
+        step = between(steps, eyes, view.camera.T_world_camera[:3, 3])
+        return moved(view, motions(step[None])[0])
 
     def _save_page(self, run: Run, mesh: trimesh.Trimesh, held_out: Sequence[Judged]) -> None:
         some = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])

@@ -31,7 +31,7 @@ def read(folder: Path) -> Shots | None:
 def _shot(folder: Path, words: list[str], field: str) -> Shot:
     with about(field):
         image = file_of(folder, {"imgname": words[0]}, "imgname")
-        with explained(f"{words[0]} is followed by {len(words) - 1} words; {NUMBERS} numbers are needed, for K, R and t"):
+        with explained(f"{words[0]} is followed by {len(words) - 1} words; {NUMBERS} numbers are needed: K, R, t"):
             numbers = np.array(words[1:], np.float64)
             intrinsics, rotation, shift = np.split(numbers.reshape(NUMBERS), (9, 18))
         intrinsics, rotation = intrinsics.reshape(3, 3), rotation.reshape(3, 3)
