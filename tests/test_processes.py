@@ -51,6 +51,7 @@ def test_ctrl_c_reaches_all_processes_and_only_the_first_speaks(tmp_path: Path) 
         "from functools import partial; from pathlib import Path; from test_processes import begun\n"
         "from distrace.processes import each_done\n"
         "if __name__ == '__main__':\n"
+        "    import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells have jobs ignore it
         "    try: list(each_done(partial(begun, Path(r'{folder}')), [60], 1))\n"
         "    except KeyboardInterrupt: print('stopped')\n"
     )

@@ -47,8 +47,8 @@ def chunked(sdf: SDF, size: int) -> SDF:
     def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         flat = points.reshape(-1, 3)
         if len(flat) <= size:
-            return sdf(points)
-        return torch.cat([sdf(part) for part in flat.split(size)]).reshape(points.shape[:-1])
+            return asked(sdf, points)
+        return torch.cat([asked(sdf, part) for part in flat.split(size)]).reshape(points.shape[:-1])
 
     return field
 
