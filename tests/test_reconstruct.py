@@ -152,6 +152,13 @@ def test_retouching_moves_colours_alone(views: list[Photograph], fitted: Reconst
     assert torch.equal(state.steps_of_views, fitted.steps_of_views)
 
 
+def test_without_a_surface_nothing_is_retouched(views: list[Photograph], fitted: Reconstruction) -> None:
+    state = deepcopy(fitted)
+    with torch.no_grad():
+        state.surface.last.bias[0] += 5.0
+    assert list(reconstruct(views[1:], state, replace(SHORT, retouching=60))) == []
+
+
 def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]) -> None:
     steps = torch.tensor([[0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.5], [0.0] * 6])
     turned, still = motions(steps)

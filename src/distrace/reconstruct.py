@@ -179,14 +179,14 @@ def reconstruct(
 
 
 def _retouched(photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig) -> Iterator[Step]:
-    """The last steps, of colours alone."""
+    """The last steps, of colours alone; none where no ray meets the surface."""
     began, surface = time.perf_counter(), CountedSurface(state.surface)
     finest = Pool.of([each.at_most(config.sizes[-1]) for each in photographs]).pixels
     with torch.no_grad():
         pixels = finest.to(state.surface.last.weight.device).moved(state.motions())
     canvas = Canvas.of(surface, pixels, _drawing(config, config.steps))
     state.evaluations += surface.evaluations
-    while state.step < config.total:
+    while len(canvas.points) and state.step < config.total:
         term = canvas.term(state.colour, config.retouched, _drawing(config, state.step))
         yield _stepped(state, term, {"retouch": term}, config, began)
         began = time.perf_counter()
