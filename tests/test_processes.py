@@ -45,24 +45,40 @@ def test_results_come_as_they_are_done_and_what_is_left_ends_with_the_caller(tmp
     assert not alive(process)
 
 
+PROGRAM = (
+    "from functools import partial; from pathlib import Path; from test_processes import begun\n"
+    "from distrace.processes import each_done\n"
+    "if __name__ == '__main__':\n"
+    "    import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells have jobs ignore it
+    "    try: list(each_done(partial(begun, Path(r'{folder}')), [300], 1))\n"
+    "    except KeyboardInterrupt: print('stopped')\n"
+)
+
+
+def at_work(folder: Path) -> subprocess.Popen:
+    """A process that has begun another, which is at work."""
+    script = folder / "work.py"
+    script.write_text(PROGRAM.format(folder=folder))
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
+    pipe, words = subprocess.PIPE, [sys.executable, script]
+    process = subprocess.Popen(words, stdout=pipe, stderr=pipe, env=environment, start_new_session=True, text=True)
+    waited_for(folder / "300")
+    return process
+
+
 @pytest.mark.skipif(sys.platform == "win32", reason="its consoles have no process groups")
 def test_ctrl_c_reaches_all_processes_and_only_the_first_speaks(tmp_path: Path) -> None:
-    program = (
-        "from functools import partial; from pathlib import Path; from test_processes import begun\n"
-        "from distrace.processes import each_done\n"
-        "if __name__ == '__main__':\n"
-        "    import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells have jobs ignore it
-        "    try: list(each_done(partial(begun, Path(r'{folder}')), [60], 1))\n"
-        "    except KeyboardInterrupt: print('stopped')\n"
-    )
-    script = tmp_path / "work.py"
-    script.write_text(program.format(folder=tmp_path))
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(Path(__file__).parent), *sys.path])}
-    pipe = subprocess.PIPE
-    process = subprocess.Popen(
-        [sys.executable, script], stdout=pipe, stderr=pipe, env=environment, start_new_session=True, text=True
-    )
-    waited_for(tmp_path / "60")
+    process = at_work(tmp_path)
     os.killpg(process.pid, signal.SIGINT)
-    said, complained = process.communicate(timeout=50)
+    said, complained = process.communicate(timeout=60)
     assert (said.strip(), complained.strip()) == ("stopped", "")
+
+
+def test_processes_end_with_a_caller_that_is_killed(tmp_path: Path) -> None:
+    process = at_work(tmp_path)
+    process.kill()
+    process.wait()
+    patience = time.monotonic() + 60
+    while alive(int((tmp_path / "300").read_text())):
+        assert time.monotonic() < patience
+        time.sleep(0.05)

@@ -1,11 +1,12 @@
 """Work that is done in several processes at once."""
 
+import os
 import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from multiprocessing import get_context
-from threading import current_thread, main_thread
+from multiprocessing import get_context, parent_process
+from threading import Thread, current_thread, main_thread
 from typing import TypeVar
 
 import torch
@@ -19,8 +20,7 @@ def each_done(work: Callable[[Task], Result], wanted: Sequence[Task], jobs: int)
 
     Where the caller stops, by Ctrl-C or otherwise, they are ended: what they write must be whole or absent.
     """
-    context = get_context("spawn")
-    pool = ProcessPoolExecutor(jobs, mp_context=context, initializer=torch.set_num_threads, initargs=(1,))
+    pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin)
     with _deaf_children():
         pending = [pool.submit(work, task) for task in wanted]
     workers = list((pool._processes or {}).values())  # a public way to end them comes with Python 3.14
@@ -33,6 +33,20 @@ def each_done(work: Callable[[Task], Result], wanted: Sequence[Task], jobs: int)
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _begin() -> None:
+    """In a process of its own: one thread for the work, and one that waits for the end of who began it."""
+    torch.set_num_threads(1)
+    Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A caller that is killed ends nobody: without this, its processes would wait for work for ever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 @contextmanager
