@@ -12,7 +12,7 @@ import tyro
 from distrace.cli.common import ModelName, opened
 from distrace.cli.completion import Surface, Task, complete
 from distrace.cli.console import console, start
-from distrace.data.cloud import load_cloud
+from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.view import View, load_view
 from distrace.errors import explained
 from distrace.fit import FitConfig
@@ -53,11 +53,17 @@ class Complete:
             raise ValueError(f"{given} were given; one cannot be negative, and at least one point is needed")
         full = load_cloud(self.observation) if cloud else load_view(self.observation)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
-        if isinstance(known, View) and not (known if chosen is FitConfig else known.without("normal")).observed.any():
-            left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
-            raise ValueError(f"{self.observation}{left} has no depth and no mask of the object to complete it from")
+        self._check(known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
         complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
+
+    def _check(self, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
+        """Raises `ValueError` where nothing that the solver uses is left."""
+        if isinstance(known, View):
+            used = known if chosen is FitConfig else known.without("normal")
+            if not used.observed.any():
+                left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
+                raise ValueError(f"{self.observation}{left} has no depth and no mask of the object to complete it from")
 
 
 @dataclass(frozen=True)
