@@ -118,6 +118,11 @@ def test_another_method_is_named(place: Place) -> None:
         done(place, trial(place, method="magic"))
 
 
+def test_a_resolution_that_no_mesh_has_is_refused_before_the_fit(place: Place) -> None:
+    with pytest.raises(ValueError, match="resolution"):
+        done(replace(place, resolution=1), trial(place, method="magic"))
+
+
 def made(method: str, density: str, chamfer: float, shape: str = "b") -> Done:
     return Done(Trial("sofas", shape, 0, method, density), chamfer / 4, 3 * chamfer / 4, 1.0, 10, [0.0])
 

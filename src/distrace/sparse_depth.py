@@ -154,10 +154,11 @@ def done(place: Place, trial: Trial) -> Done:
         kept = read_json(path)
         if kept.pop("made_by", None) == mark:
             return Done(Trial(**kept.pop("trial")), **kept)
+    resolved = MeshConfig(place.resolution)
     steps = list(steps_of(model, observed(trial, place.meshes), trial.method, config))
     code = steps[-1].code
     try:
-        found = extract_mesh(model.field(code), MeshConfig(place.resolution))
+        found = extract_mesh(model.field(code), resolved)
     except ValueError:  # it has no surface
         found = _nothing()
     distance = chamfer(found, true_solid(place.meshes, trial.category, trial.shape).surface)
