@@ -263,6 +263,34 @@ def spheres_split(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]
     return folder / "balls.csv", folder
 
 
+def test_invent_writes_meshes_that_are_sampled_and_learnt_with_the_class(run: Command, tmp_path: Path) -> None:
+    meshes, samples = tmp_path / "meshes", tmp_path / "samples"
+    run("invent", "tables", "--count", "3", "--out", meshes)
+    assert result(meshes, "class", "meshes", "seed")["meshes"] == 3
+    assert names(meshes) == {"tables~1.ply", "tables~2.ply", "tables~3.ply", "preview.png", "result.json"}
+    first = (meshes / "tables~1.ply").read_bytes()
+    run("invent", "tables", "--count", "1", "--out", tmp_path / "fewer")
+    assert (tmp_path / "fewer" / "tables~1.ply").read_bytes() == first
+    run("sample", meshes, "--out", samples, "--count", "1000", "--workers", "1")
+    run(
+        "train",
+        samples,
+        "--split",
+        "tables",
+        "--out",
+        tmp_path / "model",
+        "--steps",
+        "2",
+        "--layers",
+        "2",
+        "--width",
+        "16",
+        "--code-length",
+        "4",
+    )
+    assert load_model(tmp_path / "model").shapes == ("tables~1", "tables~2", "tables~3")
+
+
 def test_evaluate_held_out_tells_a_model_all_distances(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
 ) -> None:
@@ -443,6 +471,9 @@ def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
 BAD = [
     ("", "Missing subcommand Expected"),
     ("paint", "paint"),
+    ("invent planes", "planes"),
+    ("invent sofas --count 0", "--count 0 was given; at least one shape"),
+    ("invent sofas --count 1 --out {tmp}/text", "text is a file"),
     ("render", "MODEL"),
     ("render {tmp}/missing", "neither a folder nor a bundled model"),
     ("render {tmp}/text", "neither a folder nor a bundled model"),

@@ -21,7 +21,7 @@ class SampleFitConfig:
     learning_rate: float = 5e-3
     samples: int = 8000  # of each iteration
     clamp: float = 0.1
-    code_penalty: float = 1e-4
+    code_weight: float = 1e-4  # × the mean of the code's squares
     code_deviation: float = 0.01  # of the first code's entries
     seed: int = 0
 
@@ -42,7 +42,7 @@ def fit_samples(
         optimiser.param_groups[0]["lr"] = config.learning_rate * (0.1 if late else 1.0)
         batch = samples[torch.randint(len(samples), (min(config.samples, len(samples)),), generator=random)]
         distance = clamped_loss(decoder.field(code)(batch[:, :3]), batch[:, 3], config.clamp)
-        loss = distance + config.code_penalty * code.square().sum()
+        loss = distance + config.code_weight * code.square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

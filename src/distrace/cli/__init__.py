@@ -12,7 +12,7 @@ from distrace.cli.bench import Bench
 from distrace.cli.clip import Clip
 from distrace.cli.complete import Complete, Demo
 from distrace.cli.console import errors
-from distrace.cli.data import Data, Sample
+from distrace.cli.data import Data, Invent, Sample
 from distrace.cli.evaluate import Evaluate
 from distrace.cli.gradients import CheckGradients
 from distrace.cli.multiview import Multiview
@@ -30,6 +30,7 @@ COMMANDS = {
     "multiview": Multiview,
     "reconstruct": Reconstruct,
     "data": Data,
+    "invent": Invent,
     "sample": Sample,
     "clip": Clip,
     "train": Train,

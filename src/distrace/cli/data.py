@@ -1,18 +1,28 @@
-"""`data` and `sample`: from packages of meshes to signed samples."""
+"""`data`, `invent` and `sample`: from packages of meshes, or from nothing, to signed samples."""
 
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
+import numpy as np
+import trimesh
 import tyro
 
+from distrace.bench import poster_view
 from distrace.cli.common import Flag
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
 from distrace.data.catalogue import summary
+from distrace.data.inventing import invented
 from distrace.data.samples import Doubt
+from distrace.data.solid import Solid, normalised
 from distrace.data.split import every_mesh, read_split
+from distrace.data.view import observe
+from distrace.files import written
+from distrace.shading import Picture, grid, save_png
+
+PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
 
 
 @dataclass(frozen=True)
@@ -31,6 +41,39 @@ class Data:
         if self.name == "furniture":
             console.print(f"{furniture.left_out(run.out)} models in other formats are left out")
         run.finish({"source": self.name, "meshes": len(meshes)})
+
+
+@dataclass(frozen=True)
+class Invent:
+    """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
+
+    category: tyro.conf.Positional[Literal["sofas", "chairs", "tables"]]
+    count: int = 240
+    out: Path | None = None  # by default out/invented-sofas and so on
+    seed: int = 0
+
+    def run(self) -> None:
+        run = start(self.out or Path("out") / f"invented-{self.category}")
+        if self.count < 1:
+            raise ValueError(f"--count {self.count} was given; at least one shape is needed")
+        pictures = []
+        with progress("inventing", self.count) as bar:
+            for number in range(1, self.count + 1):
+                mesh = invented(self.category, np.random.default_rng([self.seed, number]))
+                with written(run.out / f"{self.category}~{number}.ply") as part:
+                    mesh.export(part, file_type="ply")
+                if number <= PREVIEWED:
+                    pictures.append(_looked_at(mesh))
+                bar.advance(str(number))
+        save_png(run.out / "preview.png", grid([pictures[k : k + ACROSS] for k in range(0, len(pictures), ACROSS)]))
+        run.finish({"class": self.category, "meshes": self.count, "seed": self.seed})
+
+
+def _looked_at(mesh: trimesh.Trimesh) -> Picture:
+    scaled = normalised(mesh)
+    picture = observe(Solid(scaled, scaled), poster_view(TILE)).shaded
+    assert picture is not None
+    return picture
 
 
 @dataclass(frozen=True)

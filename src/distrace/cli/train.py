@@ -40,7 +40,7 @@ class Train:
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: str | None = None  # learn only the training shapes of this split, and their variants
+    split: str | None = None  # learn only the training shapes of this split, their variants, and what was invented
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
@@ -134,7 +134,7 @@ def _sampled_meshes(meshes: Path, out: Path) -> Path:
 def _sample_files(folder: Path, split: str | None) -> list[Path]:
     paths = sorted(folder.glob("*.npz"))
     if split:
-        wanted = {shape.name for shape in on_side("train", split)}
+        wanted = {split, *(shape.name for shape in on_side("train", split))}  # what was invented is called sofas~1
         paths = [path for path in paths if path.stem.split("~")[0] in wanted]
     if not paths:
         what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"

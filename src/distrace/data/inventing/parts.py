@@ -1,0 +1,81 @@
+"""What furniture is put together from: rounded blocks and rods, each the convex hull of some points.
+
+Sizes are in metres, y is up, and fronts look to +z.
+"""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+import trimesh
+from jaxtyping import Float
+
+Part = Float[np.ndarray, "points 3"]
+"""Points whose convex hull is the part."""
+
+Point = tuple[float, float, float]
+Vector = Sequence[float] | Float[np.ndarray, "3"]
+
+BALL = trimesh.creation.icosphere(subdivisions=2).vertices.view(np.ndarray)
+CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
+
+
+def block(low: Vector, high: Vector, radius: float) -> Part:
+    """A box with rounded edges."""
+    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    radius = min(radius, 0.499 * float((high - low).min()))
+    middle, half = (low + high) / 2, (high - low) / 2 - radius
+    return (middle + BALL[:, None] * radius + half * CORNERS).reshape(-1, 3)
+
+
+def rod(begin: Vector, end: Vector, thin: float, thick: float, sides: int = 12) -> Part:
+    """A round rod from one end, of radius `thin`, to the other, of radius `thick`."""
+    begin, end = np.asarray(begin, np.float64), np.asarray(end, np.float64)
+    along = end - begin
+    across = np.linalg.svd(along[None])[2][1:]
+    angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
+    ring = np.stack([np.cos(angles), np.sin(angles)], axis=1) @ across
+    return np.concatenate([begin + thin * ring, end + thick * ring])
+
+
+def post(begin: Vector, end: Vector, thin: float, thick: float) -> Part:
+    """An upright one that is square."""
+    square = np.array([[x, 0.0, z] for x in (-1, 1) for z in (-1, 1)])
+    return np.concatenate([np.asarray(begin) + thin * square, np.asarray(end) + thick * square])
+
+
+def bar(begin: Vector, end: Vector, radius: float) -> Part:
+    """A round one, as thick everywhere."""
+    return rod(begin, end, radius, radius, 8)
+
+
+def disc(place: Vector, radius: float, thick: float, narrow: float = 1.0) -> Part:
+    """A lying one, from its underside's middle upwards; `narrow` × as deep as wide."""
+    x, y, z = place
+    lying = rod(place, (x, y + thick, z), radius, radius, 48)
+    return lying * (1, 1, narrow)
+
+
+def bowed(low: Vector, high: Vector, bow: float, radius: float) -> list[Part]:
+    """A board that stands, its sides further in front by `bow` than its middle."""
+    ends = np.linspace(low[0], high[0], 2 if not bow else 8)
+    depths = bow * (ends / max(abs(ends[0]), 1e-9)) ** 2
+    edges = [block((x, low[1], low[2] + z), (x + 1e-3, high[1], high[2] + z), radius) for x, z in zip(ends, depths)]
+    return [np.concatenate(pair) for pair in pairwise(edges)]
+
+
+def row(count: int, low: Vector, high: Vector, radius: float, axis: int = 0) -> list[Part]:
+    """Blocks side by side."""
+    ends = np.linspace(low[axis], high[axis], count + 1)
+    parts = []
+    for first, last in pairwise(ends):
+        begin, end = np.array(low, np.float64), np.array(high, np.float64)
+        begin[axis], end[axis] = first, last
+        parts.append(block(begin, end, radius))
+    return parts
+
+
+def tilted(part: Part, degrees: float) -> Part:
+    """Turned about the x axis: what is above the origin goes to the front, or, for negative angles, to the rear."""
+    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return part @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])

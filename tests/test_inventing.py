@@ -1,0 +1,93 @@
+"""Shapes put together at random: closed, upright, facing forward, and each of its own."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from distrace.cli.train import _sample_files
+from distrace.data.inventing import INVENTORS, invented
+from distrace.data.inventing.parts import block, bowed, disc, rod, row, tilted
+
+CLASSES = tuple(INVENTORS)
+
+
+@pytest.mark.parametrize("category", CLASSES)
+@pytest.mark.parametrize("seed", range(12))
+def test_a_shape_is_closed_and_stands_on_the_floor(category: str, seed: int) -> None:
+    mesh = invented(category, np.random.default_rng(seed))
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert 0 < mesh.volume < mesh.bounding_box.volume
+    assert mesh.bounds[0, 1] == pytest.approx(0, abs=0.06)
+    assert mesh.bounds[1, 1] < 1.5
+
+
+@pytest.mark.parametrize("category", CLASSES)
+def test_a_seed_gives_the_same_shape_and_another_gives_another(category: str) -> None:
+    first, again, other = (invented(category, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(first.vertices, again.vertices)
+    assert not np.allclose(first.bounds, other.bounds)
+
+
+@pytest.mark.parametrize("category", ["sofas", "chairs"])
+def test_backs_are_at_the_rear(category: str) -> None:
+    """The highest fifth of a shape lies behind its middle, in all but what has no back."""
+    behind = []
+    for seed in range(30):
+        mesh = invented(category, np.random.default_rng(seed))
+        low, high = mesh.bounds
+        top = mesh.triangles_center[:, 1] > low[1] + 0.8 * (high - low)[1]
+        behind.append(np.average(mesh.triangles_center[top, 2], weights=mesh.area_faces[top]) < (low + high)[2] / 2)
+    assert np.mean(behind) > 0.8
+
+
+def test_nothing_is_invented_of_another_class() -> None:
+    with pytest.raises(ValueError, match=r"shapes of planes cannot be invented; those of sofas, chairs, tables can"):
+        invented("planes", np.random.default_rng(0))
+
+
+def test_a_block_fills_its_box_but_for_its_edges() -> None:
+    points = block((-1, 0, -2), (1, 1, 3), 0.1)
+    assert points.min(0) == pytest.approx([-1, 0, -2], abs=1e-9)
+    assert points.max(0) == pytest.approx([1, 1, 3], abs=1e-9)
+    beyond = np.abs(points - (0, 0.5, 0.5)) - (0.9, 0.4, 2.4)
+    assert np.linalg.norm(beyond.clip(0), axis=1).max() == pytest.approx(0.1)
+
+
+def test_a_rod_has_its_two_radii_across_its_length() -> None:
+    begin, end = np.array([1.0, 2, 3]), np.array([2.0, 4, 5])
+    ends = np.split(rod(begin, end, 0.1, 0.3), 2)
+    for points, middle, radius in zip(ends, (begin, end), (0.1, 0.3)):
+        assert np.linalg.norm(points - middle, axis=1) == pytest.approx(radius)
+        assert (points - middle) @ (end - begin) == pytest.approx(0, abs=1e-12)
+
+
+def test_a_disc_lies_on_its_place() -> None:
+    points = disc((0, 1, 0), 2.0, 0.5, narrow=0.5)
+    assert points.min(0) == pytest.approx([-2, 1, -1])
+    assert points.max(0) == pytest.approx([2, 1.5, 1])
+
+
+def test_a_row_shares_its_box() -> None:
+    parts = row(3, (0, 0, 0), (3, 1, 2), 0.1)
+    assert [part.min(0)[0] for part in parts] == pytest.approx([0, 1, 2], abs=1e-9)
+    assert [part.max(0)[0] for part in parts] == pytest.approx([1, 2, 3], abs=1e-9)
+
+
+def test_the_sides_of_a_bowed_board_are_in_front() -> None:
+    points = np.concatenate(bowed((-1, 0, 0), (1, 1, 0.1), 0.3, 0.01))
+    sides = points[np.abs(points[:, 0]) > 0.9, 2].min()
+    assert sides > points[np.abs(points[:, 0]) < 0.2, 2].max() - 0.1 > -0.1
+    assert sides > 0.2
+
+
+def test_what_leans_backwards_has_its_top_behind() -> None:
+    assert tilted(np.array([[0.0, 1, 0]]), -90) == pytest.approx(np.array([[0.0, 0, -1]]))
+
+
+def test_a_split_is_learnt_with_what_was_invented_of_it(tmp_path: Path) -> None:
+    for name in ("armchair-cc0", "armchair-cc0~warped1", "cafe-chair", "chairs~1", "sofas~1"):
+        (tmp_path / f"{name}.npz").touch()
+    names = [path.stem for path in _sample_files(tmp_path, "chairs")]
+    assert names == ["armchair-cc0", "armchair-cc0~warped1", "chairs~1"]  # cafe-chair is held out
