@@ -10,12 +10,13 @@ from torch import Tensor
 
 from distrace.code_residuals import Seen
 from distrace.decoder import FAR, Decoder
-from distrace.field import SDF
 from distrace.prior import Prior
 
 DEPTHS, SILHOUETTE = 100, 300  # rays of a view that hints are taken from
 FREE = 3.0  # × counts, in the mean, what is inside and should not be: a point in the free space seldom says anything
-SCREEN = 4  # one in so many hints is asked of all codes, all of one in so many codes
+SCREENS = (16, 4, 1)  # one in so many hints is asked of all codes, more of those that are left, …
+KEPT = 4  # … one in so many, and at last all
+AT_ONCE = 8192  # points, of several codes
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,14 @@ class Hints:
         return Hints(torch.cat(points), torch.cat(distances))
 
     @torch.no_grad()
-    def contradicted(self, sdf: SDF) -> float:
-        """How far, in the mean, a shape is from being as it is known to be."""
-        values, free = sdf(self.points).clamp(-FAR, FAR), self.distances.isinf()
-        apart = (values - self.distances.clamp(-FAR, FAR)).abs()[~free]
-        inside = (-values[free]).clamp_min(0)
-        return float(apart.sum() / max(len(apart), 1) + FREE * inside.sum() / max(len(inside), 1))
+    def contradicted(self, decoder: Decoder, codes: Float[Tensor, "codes length"]) -> Float[Tensor, "codes"]:
+        """How far, in the mean, each shape is from being as it is known to be."""
+        free, together = self.distances.isinf(), max(AT_ONCE // max(len(self.points), 1), 1)
+        parts = [decoder(self.points.expand(len(some), -1, -1), some[:, None]) for some in codes.split(together)]
+        values = torch.cat(parts).clamp(-FAR, FAR)
+        apart = (values - self.distances.clamp(-FAR, FAR)).abs()[:, ~free]
+        inside = (-values[:, free]).clamp_min(0)
+        return apart.sum(1) / max(apart.shape[1], 1) + FREE * inside.sum(1) / max(inside.shape[1], 1)
 
     def every(self, step: int) -> "Hints":
         return Hints(self.points[::step], self.distances[::step])
@@ -68,10 +71,12 @@ def first_of(decoder: Decoder, prior: Prior, hints: Hints, count: int, seed: int
 
 def _nearest(decoder: Decoder, codes: Sequence[Tensor], hints: Hints, count: int) -> tuple[list[Tensor], int]:
     """The codes that contradict the hints least, and how often the field was asked for."""
-    evaluations = 0
-    if not count:
+    left, evaluations = torch.stack(list(codes)) if codes else torch.empty(0), 0
+    if not count or not len(left):
         return [], evaluations
-    for some, kept in ((hints.every(SCREEN), max(count, len(codes) // SCREEN)), (hints, count)):
-        evaluations += len(codes) * len(some.points)
-        codes = sorted(codes, key=lambda code: some.contradicted(decoder.field(code)))[:kept]
-    return list(codes), evaluations
+    for step in SCREENS:
+        some = hints.every(step)
+        evaluations += len(left) * len(some.points)
+        order = some.contradicted(decoder, left).argsort(stable=True)
+        left = left[order[: max(len(left) // KEPT, count)]]
+    return list(left[:count]), evaluations
