@@ -172,8 +172,8 @@ def test_a_network_moves_its_outline_with_its_code() -> None:
         image = shade(render(model.field(code + step.float() * direction), camera), black, WHITE.float())
         return (image * ramp(size)).mean()
 
-    expected = difference(lambda step: mean(step, 192), 0.0, 0.05)
-    assert derivative(lambda step: mean(step, 64), 0.0) == pytest.approx(expected, rel=0.05)
+    expected = difference(lambda step: mean(step, 384), 0.0, 0.05)  # whole pixels change: noisy in small images
+    assert derivative(lambda step: mean(step, 192), 0.0) == pytest.approx(expected, rel=0.05)
 
 
 def test_values_are_those_at_the_centres_of_pixels() -> None:
