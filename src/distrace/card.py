@@ -12,10 +12,10 @@ from distrace.bench import poster_view
 from distrace.checkpoint import Model
 from distrace.data.solid import solid_of
 from distrace.data.split import Shape
-from distrace.data.view import observe
+from distrace.data.view import pictured
 from distrace.render import render
 from distrace.report import View
-from distrace.shading import Picture, grid, side_by_side
+from distrace.shading import Picture, grid, in_rows, side_by_side
 
 TILE = 128  # pixels
 ACROSS = 8  # pairs in a row
@@ -27,12 +27,11 @@ def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Pictur
     camera, pairs = poster_view(TILE), []
     for shape in shapes:
         if shape.name in model.shapes:
-            truth = observe(solid_of(shape, meshes), camera).shaded
-            assert truth is not None
+            truth = pictured(solid_of(shape, meshes), camera)
             pairs.append(side_by_side([truth, _shaded(model, model.code_of(shape.name))], gap=0))
     blank = np.full_like(pairs[0], 255)
     pairs += [blank] * (-len(pairs) % min(ACROSS, len(pairs)))
-    return grid([pairs[k : k + ACROSS] for k in range(0, len(pairs), ACROSS)])
+    return in_rows(pairs, ACROSS)
 
 
 def walks_picture(model: Model, shapes: Sequence[Shape]) -> Picture:

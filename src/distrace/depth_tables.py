@@ -8,7 +8,7 @@ import torch
 
 from distrace.camera import Camera
 from distrace.charts import steps_chart
-from distrace.data.view import observe
+from distrace.data.view import pictured
 from distrace.page import Html, figure, page, paragraph, section, table
 from distrace.render import render
 from distrace.report import View
@@ -150,8 +150,7 @@ def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Pl
         for each in results
         if (each.trial.shape, each.trial.view, _condition(each)) == (one.trial.shape, one.trial.view, _condition(one))
     }
-    truth = observe(true_solid(place.meshes, one.trial.category, one.trial.shape), camera).shaded
-    assert truth is not None
+    truth = pictured(true_solid(place.meshes, one.trial.category, one.trial.shape), camera)
     blank = np.full((PICTURE, PICTURE, 3), 255, np.uint8)
     return [truth, *(_shaded(made[method], camera, place) if method in made else blank for method in methods)]
 

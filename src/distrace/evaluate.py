@@ -15,7 +15,7 @@ from distrace.code_residuals import Comparison
 from distrace.data.samples import sample
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape
-from distrace.data.view import observe
+from distrace.data.view import observe, pictured
 from distrace.fit_code import CodeFitConfig, fit_points
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
@@ -130,6 +130,4 @@ def picture_of(results: list[Result]) -> Picture:
 
 def drawn(mesh: trimesh.Trimesh) -> Picture:
     """A mesh as the poster's camera sees it."""
-    picture = observe(Solid(mesh, mesh), poster_view(OBSERVATION_SIZE)).shaded
-    assert picture is not None
-    return picture
+    return pictured(Solid(mesh, mesh), poster_view(OBSERVATION_SIZE))

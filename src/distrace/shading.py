@@ -116,6 +116,11 @@ def side_by_side(pictures: Sequence[Picture], gap: int = 8) -> Picture:
     return grid([pictures], gap)
 
 
+def in_rows(pictures: Sequence[Picture], across: int) -> Picture:
+    """Pictures one after the other, so many in a row."""
+    return grid([pictures[k : k + across] for k in range(0, len(pictures), across)])
+
+
 def grid(rows: Sequence[Sequence[Picture]], gap: int = 8) -> Picture:
     """Rows of pictures, in cells as large as the largest picture."""
     pictures = [picture for row in rows for picture in row]

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import trimesh
 import tyro
 
 from distrace.bench import poster_view
@@ -18,9 +17,9 @@ from distrace.data.inventing import invented
 from distrace.data.samples import Doubt
 from distrace.data.solid import Solid, normalised
 from distrace.data.split import every_mesh, read_split
-from distrace.data.view import observe
+from distrace.data.view import pictured
 from distrace.files import written
-from distrace.shading import Picture, grid, save_png
+from distrace.shading import in_rows, save_png
 
 PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
 
@@ -63,17 +62,11 @@ class Invent:
                 with written(run.out / f"{self.category}~{number}.ply") as part:
                     mesh.export(part, file_type="ply")
                 if number <= PREVIEWED:
-                    pictures.append(_looked_at(mesh))
+                    scaled = normalised(mesh)
+                    pictures.append(pictured(Solid(scaled, scaled), poster_view(TILE)))
                 bar.advance(str(number))
-        save_png(run.out / "preview.png", grid([pictures[k : k + ACROSS] for k in range(0, len(pictures), ACROSS)]))
+        save_png(run.out / "preview.png", in_rows(pictures, ACROSS))
         run.finish({"class": self.category, "meshes": self.count, "seed": self.seed})
-
-
-def _looked_at(mesh: trimesh.Trimesh) -> Picture:
-    scaled = normalised(mesh)
-    picture = observe(Solid(scaled, scaled), poster_view(TILE)).shaded
-    assert picture is not None
-    return picture
 
 
 @dataclass(frozen=True)

@@ -124,3 +124,10 @@ def observe(solid: Solid, camera: Camera) -> View:
     shape = (camera.height, camera.width)
     depth = depth.reshape(shape)
     return View(camera, depth, torch.isfinite(depth), normal.reshape(*shape, 3))
+
+
+def pictured(solid: Solid, camera: Camera) -> Picture:
+    """A mesh's outer surface as clay."""
+    picture = observe(solid, camera).shaded
+    assert picture is not None
+    return picture
