@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import math
 import re
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -237,3 +238,19 @@ def test_a_scene_keeps_the_colours_of_vertices_where_there_are_some() -> None:
     assert "vertexcolor" not in str(scene.scene({"ball": ball}, {}))
     painted = trimesh.Trimesh(ball.vertices, ball.faces, vertex_colors=[255, 0, 128], process=False)
     assert '"vertexcolor":["#ff0080","#ff0080"' in str(scene.scene({"ball": painted}, {}))
+
+
+@pytest.mark.parametrize("sides", [(1, 1, 1), (0.4, 2, 0.4), (0.4, 0.4, 4), (2, 0.5, 2), (1, 0, 0)])
+def test_all_of_a_scene_is_in_its_picture_and_fills_it(sides: tuple[float, float, float]) -> None:
+    corners = np.array(trimesh.creation.box(np.maximum(sides, 1e-9)).vertices) + 5.0
+    eye = json.loads(Reader(scene.scene({}, {"corners": corners})).scripts[0])["layout"]["scene"]["camera"]["eye"]
+    unit = np.prod(np.maximum(sides, 0.01 * max(sides))) ** (1 / 3)
+    at = torch.tensor([eye["y"], eye["z"], eye["x"]]) * unit + 5.0
+    camera = Camera.look_at(at, torch.full((3,), 5.0), height=100, width=150, focal_px=50 / math.tan(math.pi / 8))
+    pixels = camera.project(torch.from_numpy(corners).float())[0]
+    from_middle = (pixels / torch.tensor([75.0, 50.0]) - 1).abs().max()
+    assert 0.8 < from_middle < 1
+
+
+def test_a_scene_of_nothing_is_a_scene() -> None:
+    assert Reader(scene.scene({}, {"nothing": np.empty((0, 3))})).scripts

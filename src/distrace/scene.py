@@ -15,6 +15,10 @@ from distrace.page import Html
 
 MOST_FACES = 60_000
 MOST_POINTS = 8_000
+DIRECTION = (1.4, 0.8, 0.6)  # of the eye, in plotly's axes
+FIELD_OF_VIEW = math.pi / 4  # plotly's, upright
+ASPECT = 1.5  # a little less than pages have
+MARGIN = 1.08
 
 
 def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
@@ -27,7 +31,8 @@ def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
     ]
     hidden = dict(visible=False)
-    camera = dict(eye=dict(x=1.4, y=0.8, z=0.6))
+    everything = np.concatenate([*(mesh.vertices for mesh in meshes.values()), *clouds.values()])
+    camera = dict(eye=dict(zip("xyz", _eye(everything))))
     layout = go.Layout(
         template="none",
         margin=dict(l=0, r=0, t=0, b=0),
@@ -38,6 +43,18 @@ def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray
     )
     content = str(go.Figure([*surfaces, *points], layout).to_json()).replace("<", "\\u003c")
     return Html(f'<script type="application/json">{content}</script><div class="scene"></div>')
+
+
+def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """From where the box of all points fits into the picture; plotly's unit is the geometric mean of its sides."""
+    sides = np.ptp(points[:, [2, 0, 1]], axis=0) if len(points) else np.ones(3)
+    sides = np.maximum(sides, 0.01 * max(sides.max(), 1e-9))
+    corners = sides / np.prod(sides) ** (1 / 3) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5)
+    back = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
+    right = np.cross((0, 0, 1), back) / np.hypot(*back[:2])
+    up = np.cross(back, right)
+    half = np.maximum(abs(corners @ up), abs(corners @ right) / ASPECT)
+    return (corners @ back + MARGIN * half / np.tan(FIELD_OF_VIEW / 2)).max() * back
 
 
 def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
