@@ -471,7 +471,7 @@ def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
 BAD = [
     ("", "Missing subcommand Expected"),
     ("paint", "paint"),
-    ("invent planes", "planes"),
+    ("invent lamps", "lamps"),
     ("invent sofas --count 0", "--count 0 was given; at least one shape"),
     ("invent sofas --count 1 --out {tmp}/text", "text is a file"),
     ("render", "MODEL"),

@@ -46,7 +46,7 @@ class Data:
 class Invent:
     """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
 
-    category: tyro.conf.Positional[Literal["sofas", "chairs", "tables"]]
+    category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
     count: int = 240
     out: Path | None = None  # by default out/invented-sofas and so on
     seed: int = 0

@@ -1,4 +1,4 @@
-"""Furniture that nobody drew: shapes of a class put together from blocks and rods at random.
+"""Furniture and aircraft that nobody drew: shapes of a class put together from convex parts at random.
 
 Twenty meshes of a class say little of what else there is; a network that also learns these says more shapes well.
 """
@@ -11,14 +11,20 @@ from manifold3d import Manifold, OpType
 
 from .chair import chair
 from .parts import Part
+from .plane import plane
 from .sofa import sofa
 from .table import table
 
-INVENTORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {"sofas": sofa, "chairs": chair, "tables": table}
+INVENTORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
+    "sofas": sofa,
+    "chairs": chair,
+    "tables": table,
+    "planes": plane,
+}
 
 
 def invented(category: str, random: np.random.Generator) -> trimesh.Trimesh:
-    """A closed surface in the orientation of its class, in metres.
+    """A closed surface in the orientation of its class: furniture in metres, aircraft in lengths of their fuselage.
 
     Raises `ValueError` for a class that nothing is invented of.
     """

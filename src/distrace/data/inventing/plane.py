@@ -1,0 +1,113 @@
+"""Aircraft that nobody drew: one long, the nose to +z."""
+
+import numpy as np
+
+from .airframe import SIDES, canopy, fin, fuselage, gear, jet, spinner, tail, wing
+from .parts import Part, block, rod
+
+
+def plane(random: np.random.Generator) -> list[Part]:
+    """An airliner, a propeller aircraft with one to four engines, or a fighter; its gear is out now and then."""
+    kind = random.choice(["airliner", "propeller", "fighter"], p=[0.45, 0.35, 0.2])
+    return {"airliner": airliner, "propeller": propeller, "fighter": fighter}[kind](random)
+
+
+def airliner(random: np.random.Generator) -> list[Part]:
+    """Low swept wings with jets beneath, or jets at the rear under a T-shaped tail."""
+    wide, at, span = random.uniform(0.04, 0.065), random.uniform(0.02, 0.14), random.uniform(0.75, 1.1)
+    high, rear = random.random() < 0.15, random.random() < 0.35
+    y, sweep = (0.8 if high else -0.6) * wide, random.uniform(22, 36)
+    dihedral = random.uniform(-4, 1) if high else random.uniform(3, 8)
+    wings = wing(random, (y, at), span / 2, random.uniform(0.15, 0.22), random.uniform(0.15, 0.35), sweep, dihedral)
+    parts = fuselage(random, wide, random.uniform(0.1, 0.16), random.uniform(0.28, 0.4)) + wings
+    parts += tail(random, wide, sweep + random.uniform(0, 12), on_top=high or rear or random.random() < 0.08)
+    size = wide * random.uniform(0.35, 0.6)
+    if rear:
+        parts += jets_at_rear(random, wide, size)
+    else:
+        parts += jets_beneath(random, (y, at), span / 2, size, sweep, dihedral)
+    return parts + gear(random, wide, at, 0.4)
+
+
+def jets_at_rear(random: np.random.Generator, wide: float, size: float) -> list[Part]:
+    """A pair beside the fuselage's end, and now and then a third one at the foot of the fin."""
+    out, y = wide + 0.9 * size, 0.4 * wide
+    parts = [jet((s * out, y, -0.26), size, random.uniform(0.1, 0.14)) for s in SIDES]
+    parts.append(block((-out, y - 0.004, -0.29), (out, y + 0.004, -0.24), 0.003))
+    if random.random() < 0.3:
+        parts.append(jet((0, 1.3 * wide, -0.38), 0.5 * wide, 0.24))
+    return parts
+
+
+def jets_beneath(
+    random: np.random.Generator, place: tuple[float, float], half: float, size: float, sweep: float, dihedral: float
+) -> list[Part]:
+    """One or two on pylons below each half of a wing, which begins at a height and a place along."""
+    (y, at), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
+    parts = []
+    for x in half * (random.choice([0.33, 0.3]) + 0.3 * np.arange(random.choice([1, 2], p=[0.8, 0.2]))):
+        z, under = at - x * back + random.uniform(0.02, 0.06), y + x * up - 1.15 * size
+        parts += [jet((s * x, under, z), size, random.uniform(0.08, 0.14)) for s in SIDES]
+        parts += [block((s * x - 0.004, under, z - 0.1), (s * x + 0.004, under + 1.3 * size, z), 0.003) for s in SIDES]
+    return parts
+
+
+def propeller(random: np.random.Generator) -> list[Part]:
+    """Straight wings, low, high, or two above each other; the engine in the nose, or engines on the wings."""
+    engines = int(random.choice([1, 2, 4], p=[0.55, 0.35, 0.1]))
+    wide, at = random.uniform(0.05, 0.085) if engines == 1 else random.uniform(0.045, 0.065), random.uniform(0.08, 0.2)
+    span, high = random.uniform(0.8, 1.45), random.random() < 0.5
+    chord, taper, sweep = random.uniform(0.13, 0.2), random.uniform(0.4, 1.0), random.uniform(-2, 6)
+    y, dihedral = (0.9 if high else -0.7) * wide, random.uniform(0, 2) if high else random.uniform(2, 7)
+    parts = fuselage(random, wide, random.uniform(0.06, 0.16), random.uniform(0.35, 0.6))
+    parts += wing(random, (y, at), span / 2, chord, taper, sweep, dihedral)
+    if engines == 1 and random.random() < 0.15:
+        above, out = y + random.uniform(0.12, 0.2), 0.3 * span
+        parts += wing(random, (above, at + 0.03), span / 2, chord, taper, sweep, dihedral)
+        parts += [rod((s * out, y, at - 0.05), (s * out, above, at - 0.02), 0.004, 0.004, 6) for s in SIDES]
+    elif engines == 1 and high and random.random() < 0.6:
+        parts += [rod((s * wide, -0.5 * wide, at - 0.06), (s * 0.25, y, at - 0.06), 0.004, 0.005, 6) for s in SIDES]
+    parts += tail(random, wide, random.uniform(0, 30), on_top=engines > 1 and random.random() < 0.5)
+    if engines == 1:
+        parts += [canopy(random, wide, at - random.uniform(0.0, 0.08))] if random.random() < 0.7 else []
+        return parts + spinner((0, 0, 0.5), 0.3 * wide, random.uniform(0.1, 0.15), random) + gear(random, wide, at, 0.7)
+    return parts + on_wings(random, engines // 2, (y, at), chord, dihedral) + gear(random, wide, at, 0.4)
+
+
+def on_wings(
+    random: np.random.Generator, pairs: int, place: tuple[float, float], chord: float, dihedral: float
+) -> list[Part]:
+    """Engines with propellers, through wings that begin at a height and a place along."""
+    (y, at), up = place, np.tan(np.radians(dihedral))
+    parts = []
+    for x in np.arange(1, pairs + 1) * random.uniform(0.11, 0.15) + 0.02:
+        size, high = random.uniform(0.018, 0.03), y + x * up
+        for s in SIDES:
+            parts.append(rod((s * x, high, at - chord), (s * x, high, at), 0.3 * size, size))
+            parts.append(rod((s * x, high, at), (s * x, high, at + 0.07), size, 0.7 * size))
+            parts += spinner((s * x, high, at + 0.07), 0.4 * size, 0.09, random)
+    return parts
+
+
+def fighter(random: np.random.Generator) -> list[Part]:
+    """Short swept or delta wings at half height, intakes at the sides, a canopy, one fin or two."""
+    wide, delta = random.uniform(0.04, 0.06), random.random() < 0.4
+    span, chord = random.uniform(0.5, 0.8), random.uniform(0.38, 0.5) if delta else random.uniform(0.22, 0.32)
+    at, sweep = random.uniform(0.02, 0.12), random.uniform(45, 58) if delta else random.uniform(18, 45)
+    y, taper = random.uniform(-0.4, 0.6) * wide, random.uniform(0.05, 0.2) if delta else random.uniform(0.2, 0.4)
+    parts = fuselage(random, wide, random.uniform(0.25, 0.35), random.uniform(0.15, 0.3), thick_end=0.7)
+    parts += wing(random, (y, at), span / 2, chord, taper, sweep, random.uniform(-4, 2), thick=0.05)
+    parts += [canopy(random, wide, random.uniform(0.2, 0.28))]
+    intake, end = random.uniform(0.6, 1.0) * wide, random.uniform(0.1, 0.2)
+    parts += [
+        block((s * wide - 0.4 * wide, -intake, -0.35), (s * wide + 0.4 * wide, 0.3 * intake, end), 0.012) for s in SIDES
+    ]
+    pairs = random.random() < 0.4
+    lean = random.uniform(0, 0.4) if pairs else 0.0
+    for s in SIDES if pairs else (0,):
+        parts += fin((s * wide, 0.5 * wide, -0.3), random.uniform(0.14, 0.2), 0.17, random.uniform(35, 50), lean * s)
+    if not delta:
+        parts += wing(random, (0, -0.35), random.uniform(0.16, 0.24), 0.13, 0.3, random.uniform(30, 45), 0, thick=0.05)
+    elif random.random() < 0.4:
+        parts += wing(random, (0.3 * wide, 0.22), random.uniform(0.12, 0.18), 0.1, 0.2, 45, 0, thick=0.05)
+    return parts + gear(random, wide, at - 0.1, 0.3)
