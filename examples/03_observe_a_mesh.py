@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from distrace.bench import poster_view
 from distrace.data.split import read_split
 from distrace.data.view import observe, save_view
-from distrace.evaluate import OBSERVATION_SIZE, solid_of
+from distrace.evaluation.bench import poster_view
+from distrace.evaluation.evaluate import OBSERVATION_SIZE, solid_of
 from distrace.metrics import POINTS, surface_points
 
 split, name, meshes, out = sys.argv[1:5]

@@ -1,7 +1,7 @@
 """An untrained decoder whose shapes are bumpy balls, for tests of fitting."""
 
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.growth import ball_decoder
+from distrace.evaluation.growth import ball_decoder
 
 
 def bumpy_balls() -> Decoder:

@@ -6,11 +6,11 @@ import pytest
 import torch
 from test_fit_camera import only, shape, turned, view
 
-from distrace.alignment import Still
-from distrace.blurred import SIZE, Blurred, blurred
-from distrace.fit_camera import APPROACH
+from distrace.fitting.alignment import Still
+from distrace.fitting.blurred import SIZE, Blurred, blurred
+from distrace.fitting.fit_camera import APPROACH
+from distrace.fitting.solver import minimise
 from distrace.pose import pose_error, turned_object
-from distrace.solver import minimise
 
 
 def test_a_blur_keeps_the_sum_and_spreads_it_evenly() -> None:

@@ -16,14 +16,15 @@ from test_train import SPECS, of_sphere, spheres
 import distrace.cli
 import distrace.cli.train
 import distrace.movie
-from distrace import evaluate, metrics, training_choices
+from distrace import metrics
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.data.samples import write_samples
 from distrace.data.view import View, load_view, save_view
+from distrace.evaluation import evaluate, training_choices
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
-from distrace.train import TrainConfig, start, train
+from distrace.training.train import TrainConfig, start, train
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}

@@ -3,8 +3,8 @@
 import torch
 from test_fit_photos import ring
 
-from distrace.consensus import agreed
 from distrace.data.photograph import Photograph
+from distrace.photographs.consensus import agreed
 from distrace.primitives import sphere
 from distrace.render import render
 

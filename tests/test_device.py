@@ -14,13 +14,13 @@ from distrace.checkpoint import load_model, save_experiment
 from distrace.cli import _run
 from distrace.data.photograph import Photograph
 from distrace.data.view import View
-from distrace.fit import FitConfig
-from distrace.fit_code import CodeFitConfig
-from distrace.fit_photos import fit_photos
-from distrace.methods import CLOUDS, METHODS, steps_of
-from distrace.prior import prior_of
+from distrace.fitting.fit import FitConfig
+from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.methods import CLOUDS, METHODS, steps_of
+from distrace.fitting.prior import prior_of
+from distrace.photographs.fit_photos import fit_photos
 from distrace.render import render
-from distrace.train import TrainConfig
+from distrace.training.train import TrainConfig
 
 Command = Callable[..., None]
 

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.dist_gradient import attach_dist, march
+from distrace.checking.dist_gradient import attach_dist, march
 from distrace.primitives import sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.trace import AGGRESSIVE, sphere_trace

@@ -8,14 +8,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace import fast, primitives
-from distrace.bench import reference_distance
+from distrace import primitives
 from distrace.camera import Camera
 from distrace.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.fast import fast_trace
+from distrace.evaluation.bench import reference_distance
+from distrace.fast import tracer as fast
+from distrace.fast.lattice import Lattice, LatticeConfig
+from distrace.fast.picture import FastConfig
+from distrace.fast.tracer import fast_trace
 from distrace.field import SDF, Counted
-from distrace.lattice import Lattice, LatticeConfig
-from distrace.picture import FastConfig
 from distrace.rays import meet_sphere
 from distrace.render import render
 from distrace.trace import Outcome, Trace

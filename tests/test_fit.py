@@ -12,14 +12,14 @@ from distrace import losses
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fit import FitConfig, fit_shape, view_terms
-from distrace.fit_samples import SampleFitConfig, around_points, fit_samples
+from distrace.fitting.fit import FitConfig, fit_shape, view_terms
+from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples
+from distrace.fitting.prior import LEAST_DEVIATION, Prior, prior_of
+from distrace.fitting.starts import Step
+from distrace.fitting.targets import OUTLINE, Pool, Targets
 from distrace.primitives import sphere
-from distrace.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render
-from distrace.starts import Step
-from distrace.targets import OUTLINE, Pool, Targets
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 TRUE = torch.tensor([0.45, 0.1, -0.15, 0.05])

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from distrace import primitives
-from distrace.alignment import Accuracy, Still, residuals
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.field import SDF
-from distrace.fit_camera import CameraConfig, fit_camera
+from distrace.fitting.alignment import Accuracy, Still, residuals
+from distrace.fitting.fit_camera import CameraConfig, fit_camera
+from distrace.fitting.sight import Sight, outline_of, rays_of
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render, render_rays
-from distrace.sight import Sight, outline_of, rays_of
 from distrace.trace import DYNAMIC
 
 f64 = torch.float64

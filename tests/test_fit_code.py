@@ -8,18 +8,18 @@ import torch
 from bumpy import bumpy_balls
 
 from distrace.camera import Camera
-from distrace.code_residuals import Comparison, Problem, Seen, derivatives
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
-from distrace.fit_code import CodeFitConfig, fit_code, fit_points
+from distrace.fitting.code_residuals import Comparison, Problem, Seen, derivatives
+from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
+from distrace.fitting.nearest import Hints, first_of
+from distrace.fitting.point_residuals import PointProblem, misfit
+from distrace.fitting.prior import Prior
+from distrace.fitting.solver import SolverConfig, minimise
+from distrace.fitting.starts import Step, stages_of
+from distrace.fitting.targets import Pool
 from distrace.losses import Weights
-from distrace.nearest import Hints, first_of
-from distrace.point_residuals import PointProblem, misfit
-from distrace.prior import Prior
 from distrace.render import render
-from distrace.solver import SolverConfig, minimise
-from distrace.starts import Step, stages_of
-from distrace.targets import Pool
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)

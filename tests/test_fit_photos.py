@@ -13,15 +13,15 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
-from distrace.doubtful import agreements
-from distrace.fit_photos import PhotoConfig, Search, fit_photos
-from distrace.photo_pairs import Colours, partners, without_light
-from distrace.photo_residuals import PhotoProblem, Shape
-from distrace.photo_stage import Comparing, Stage
+from distrace.fitting.prior import Prior
+from distrace.photographs.doubtful import agreements
+from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
+from distrace.photographs.photo_pairs import Colours, partners, without_light
+from distrace.photographs.photo_residuals import PhotoProblem, Shape
+from distrace.photographs.photo_stage import Comparing, Stage
+from distrace.photographs.regions import Regions, appearance
 from distrace.pose import Similarity
-from distrace.prior import Prior
 from distrace.rays import Rays, meet_sphere
-from distrace.regions import Regions, appearance
 from distrace.render import render
 
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)

@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
 from distrace import primitives
-from distrace.bench import reference_distance
+from distrace.evaluation.bench import reference_distance
+from distrace.fast.forecast import Forecast, Kind, Known, corrected, forecast
+from distrace.fast.lattice import Lattice, LatticeConfig, build
 from distrace.field import SDF
-from distrace.forecast import Forecast, Kind, Known, corrected, forecast
-from distrace.lattice import Lattice, LatticeConfig, build
 from distrace.rays import Bounds, Rays, meet_sphere
 
 f64 = torch.float64

@@ -8,11 +8,11 @@ from torch import Tensor, nn
 
 from distrace import primitives
 from distrace.camera import Camera
+from distrace.checking.differences import derivatives, differences
+from distrace.checking.gradcheck import STRAY, GradientCheck, check_gradients
+from distrace.checking.moves import decoder_changes
+from distrace.checking.retrace import DOUBLE, SINGLE, least_beside, zero_beside
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.differences import derivatives, differences
-from distrace.gradcheck import STRAY, GradientCheck, check_gradients
-from distrace.moves import decoder_changes
-from distrace.retrace import DOUBLE, SINGLE, least_beside, zero_beside
 
 CAMERA = Camera.orbit(30, 20, 4.97, height=16, width=16)
 QUANTITIES = {"distance", "depth", "hit points", "normal", "clearance"}

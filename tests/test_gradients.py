@@ -10,14 +10,14 @@ from torch.nn.functional import normalize
 
 from distrace import primitives
 from distrace.camera import Camera
+from distrace.checking.differences import Images, derivatives
+from distrace.checking.gradcheck import check_gradients
+from distrace.checking.moves import Move, all_moves
+from distrace.checking.retrace import DOUBLE, Retraced
 from distrace.checkpoint import Model
-from distrace.differences import Images, derivatives
+from distrace.evaluation.gradients import COUNT, QUERIES, RatioRow, ratio_rows, subjects
+from distrace.evaluation.growth import ball
 from distrace.field import SDF
-from distrace.gradcheck import check_gradients
-from distrace.gradients import COUNT, QUERIES, RatioRow, ratio_rows, subjects
-from distrace.growth import ball
-from distrace.moves import Move, all_moves
-from distrace.retrace import DOUBLE, Retraced
 
 f64 = torch.float64
 RADIUS, CENTRE = 0.5, torch.tensor([0.1, -0.05, 0.2], dtype=f64)

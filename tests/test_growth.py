@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 
-from distrace import growth
-from distrace.bench import poster_view, reference_distance
+from distrace.evaluation import growth
+from distrace.evaluation.bench import poster_view, reference_distance
+from distrace.evaluation.tables import growth_page
 from distrace.primitives import sphere
 from distrace.rays import meet_sphere
-from distrace.tables import growth_page
 
 
 @pytest.fixture(autouse=True)

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
 from distrace import primitives
+from distrace.fast.lattice import Lattice, LatticeConfig, build
 from distrace.field import SDF, Counted
-from distrace.lattice import Lattice, LatticeConfig, build
 
 f64 = torch.float64
 CONFIG, DOUBLE = LatticeConfig(), torch.empty(0, dtype=f64)

@@ -9,11 +9,11 @@ from torch.nn import functional as F
 
 from distrace.boundary import shade
 from distrace.data.photograph import Photograph
-from distrace.matching import ACROSS, Matching, correlation
+from distrace.fitting.targets import band
 from distrace.primitives import sphere
 from distrace.rays import Rays, meet_sphere
+from distrace.reconstruction.matching import ACROSS, Matching, correlation
 from distrace.render import render
-from distrace.targets import band
 from distrace.trace import TraceConfig, sphere_trace
 
 EXACT = TraceConfig(coarse_levels=0, tolerance=1e-5, steps=200)

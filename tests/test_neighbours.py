@@ -7,7 +7,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distrace.neighbours import SIDES, Grid
+from distrace.fast.neighbours import SIDES, Grid
 
 f64, cpu = torch.float64, torch.device("cpu")
 shapes = st.tuples(st.integers(1, 3), st.integers(1, 11), st.integers(1, 9)).map(torch.Size)

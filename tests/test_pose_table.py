@@ -5,8 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from distrace.pose import pose_error
-from distrace.pose_table import (
+from distrace.evaluation.pose_table import (
     DISTURBANCES,
     FOCAL,
     OBSERVATIONS,
@@ -21,6 +20,7 @@ from distrace.pose_table import (
     rows_of,
     write_trials,
 )
+from distrace.pose import pose_error
 
 
 def found(k: int, degrees: float, observation: str = "depth", disturbance: str = "10°") -> Found:

@@ -24,20 +24,26 @@ from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import SDF, value_and_gradient
-from distrace.hash_grid import GridSpecs, HashGrid
-from distrace.hull import overlaps, visual_hull
-from distrace.matching import Matching
-from distrace.motions import between, drift, motions, moved, relative
+from distrace.pages.reconstruction_page import judged
+from distrace.photographs.hull import overlaps, visual_hull
 from distrace.primitives import box, sphere, torus
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
-from distrace.reconstruction_page import judged
-from distrace.reconstruction_run import load_reconstruction, mark, save_reconstruction
-from distrace.reconstruction_terms import MARCH, Pool, coloured, terms_of
-from distrace.registration import registered
+from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
+from distrace.reconstruction.matching import Matching
+from distrace.reconstruction.motions import between, drift, motions, moved, relative
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
+from distrace.reconstruction.reconstruction_run import load_reconstruction, mark, save_reconstruction
+from distrace.reconstruction.reconstruction_terms import MARCH, Pool, coloured, terms_of
+from distrace.reconstruction.registration import registered
+from distrace.reconstruction.surface_network import (
+    ColourNetwork,
+    CountedSurface,
+    SurfaceNetwork,
+    SurfaceSpecs,
+    squareplus,
+)
 from distrace.render import render
 from distrace.surface import attach
-from distrace.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs, squareplus
 from distrace.trace import sphere_trace
 
 BLACK = torch.zeros(3)

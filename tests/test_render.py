@@ -8,7 +8,7 @@ from torch import Tensor
 
 from distrace import primitives
 from distrace.camera import Camera
-from distrace.picture import FastConfig
+from distrace.fast.picture import FastConfig
 from distrace.rays import meet_sphere
 from distrace.render import STRATEGIES, Buffers, Config, render, render_each, render_rays
 from distrace.trace import COARSE_TO_FINE, DYNAMIC, Outcome

@@ -14,13 +14,13 @@ import torch
 import trimesh
 from PIL import Image
 
-from distrace import charts, scene
-from distrace import page as html
 from distrace.camera import Camera
 from distrace.metrics import Chamfer
+from distrace.pages import charts, scene
+from distrace.pages import page as html
+from distrace.pages.report import Completion, View, completion_page
 from distrace.primitives import sphere
 from distrace.render import render
-from distrace.report import Completion, View, completion_page
 
 VOID = {"meta", "link", "img", "br", "path", "use"}
 

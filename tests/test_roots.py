@@ -8,9 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
+from distrace.fast.roots import Guess, Roots, settle
 from distrace.primitives import sphere
 from distrace.rays import Rays
-from distrace.roots import Guess, Roots, settle
 
 f64 = torch.float64
 TOLERANCE, REACH, COUNT = 2.5e-4, 1 / 14, 200

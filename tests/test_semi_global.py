@@ -10,9 +10,9 @@ from test_matching import stripes
 
 from distrace.boundary import shade
 from distrace.data.photograph import Photograph
+from distrace.evaluation.semi_global import Rectified, stereo_points
 from distrace.primitives import sphere
 from distrace.render import render
-from distrace.semi_global import Rectified, stereo_points
 
 
 def photographs(count: int = 24, size: int = 120) -> list[Photograph]:

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from distrace.solver import Residuals, Solution, SolverConfig, minimise
+from distrace.fitting.solver import Residuals, Solution, SolverConfig, minimise
 
 MANY = SolverConfig(iterations=100, scale=100.0, settled=0.0)
 

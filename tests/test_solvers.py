@@ -7,14 +7,14 @@ import pytest
 import torch
 import trimesh
 
-from distrace import solvers
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
+from distrace.evaluation import solvers
+from distrace.evaluation.tables import solvers_page
+from distrace.fitting.starts import Step
 from distrace.rays import meet_sphere
-from distrace.starts import Step
-from distrace.tables import solvers_page
 
 
 class Spheres(Decoder):

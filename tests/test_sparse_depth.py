@@ -10,11 +10,8 @@ import trimesh
 
 from distrace.checkpoint import Model, save_model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.depth_tables import AXES, depth_page, ratios, rows_of, wide
-from distrace.mesh import MeshConfig, extract_mesh
-from distrace.metrics import chamfer
-from distrace.rays import meet_sphere
-from distrace.sparse_depth import (
+from distrace.evaluation.depth_tables import AXES, depth_page, ratios, rows_of, wide
+from distrace.evaluation.sparse_depth import (
     AZIMUTHS_ELEVATIONS,
     CONDITIONS,
     DENSITIES,
@@ -29,6 +26,9 @@ from distrace.sparse_depth import (
     observed,
     true_solid,
 )
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.rays import meet_sphere
 
 METHODS = ("deepsdf", "ours", "ours+mask")
 

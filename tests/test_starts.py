@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from distrace.starts import Starts, Step, best_of, stages_of
+from distrace.fitting.starts import Starts, Step, best_of, stages_of
 
 
 def run(losses: list[list[float]], starts: Starts, recent: int = 8) -> list[tuple[int, int, float]]:

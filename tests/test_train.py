@@ -22,8 +22,8 @@ from distrace.checkpoint import load_model, save_experiment, save_model
 from distrace.cli import main
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
-from distrace.resume import NAME, load_training, save_training
-from distrace.train import (
+from distrace.training.resume import NAME, load_training, save_training
+from distrace.training.train import (
     Samples,
     Step,
     TrainConfig,

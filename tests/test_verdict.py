@@ -4,13 +4,13 @@ import pytest
 import torch
 
 from distrace.camera import Camera
-from distrace.code_residuals import Comparison, Seen
 from distrace.data.view import View
+from distrace.fitting.code_residuals import Comparison, Seen
+from distrace.fitting.targets import Pool
+from distrace.fitting.verdict import MOST, contradiction
 from distrace.losses import Weights
 from distrace.primitives import sphere
 from distrace.render import render
-from distrace.targets import Pool
-from distrace.verdict import MOST, contradiction
 
 CAMERA = Camera.orbit(30, 20, 3.0, height=48, width=48, focal_px=60.0)
 TRACE = Comparison().trace

@@ -9,9 +9,9 @@ from test_fit_photos import COMPARED, GREY, TRUE, photographs, ring
 
 from distrace.data.photograph import Photograph
 from distrace.field import SDF, placed
-from distrace.photo_stage import Stage
+from distrace.photographs.photo_stage import Stage
+from distrace.photographs.whereabouts import whereabouts
 from distrace.pose import Similarity
-from distrace.whereabouts import whereabouts
 
 SHIFTED = Similarity(torch.eye(3), torch.tensor([0.15, -0.1, 0.12]), torch.tensor(0.8))
 

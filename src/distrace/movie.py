@@ -11,9 +11,9 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from distrace.camera import Camera
+from distrace.fast.picture import FastConfig
 from distrace.field import SDF
 from distrace.files import written
-from distrace.picture import FastConfig
 from distrace.render import Buffers, Config, render
 from distrace.shading import Picture
 

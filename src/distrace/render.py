@@ -11,10 +11,10 @@ from torch import Tensor
 
 from distrace import pyramid, surface
 from distrace.camera import Camera
-from distrace.fast import fast_trace, near_surface
+from distrace.fast.lattice import Lattice
+from distrace.fast.picture import FastConfig
+from distrace.fast.tracer import fast_trace, near_surface
 from distrace.field import SDF
-from distrace.lattice import Lattice
-from distrace.picture import FastConfig
 from distrace.rays import Rays, meet_sphere
 from distrace.trace import MARCHES, Trace, TraceConfig, sphere_trace
 

@@ -8,12 +8,12 @@ from typing import Any, Literal
 import torch
 import tyro
 
-from distrace import ablation, backward, fields, gradients, growth, solvers, tables
-from distrace.bench import measure, poster_view
 from distrace.checkpoint import Model
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
 from distrace.data.split import on_side
+from distrace.evaluation import ablation, backward, fields, gradients, growth, solvers, tables
+from distrace.evaluation.bench import measure, poster_view
 from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 

@@ -14,9 +14,9 @@ from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
 from distrace.cli.console import console
 from distrace.files import save_arrays, written
-from distrace.page import short
+from distrace.pages.page import short
+from distrace.pages.report import View
 from distrace.render import Buffers
-from distrace.report import View
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Meshes = Annotated[

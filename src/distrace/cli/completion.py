@@ -7,24 +7,25 @@ import numpy as np
 import torch
 import trimesh
 
-from distrace import report, shading
-from distrace.bench import poster_view
+from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.cli.common import save_mesh
 from distrace.cli.console import Run, console, progress
 from distrace.data.cloud import Cloud
 from distrace.data.view import View
+from distrace.evaluation.bench import poster_view
 from distrace.files import written
-from distrace.fit import FitConfig
-from distrace.fit_code import CodeFitConfig
+from distrace.fitting.fit import FitConfig
+from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.methods import completing
+from distrace.fitting.plausible import plausible, spread
+from distrace.fitting.prior import prior_of
+from distrace.fitting.starts import Step
 from distrace.mesh import MeshConfig, extract_mesh
-from distrace.methods import completing
 from distrace.metrics import Chamfer, chamfer
-from distrace.plausible import plausible, spread
-from distrace.prior import prior_of
+from distrace.pages import report
 from distrace.render import render
-from distrace.starts import Step
 
 Surface = trimesh.Trimesh | np.ndarray
 CLOUD_SIZE = 256  # pixels of the pictures of a cloud's completion

@@ -8,7 +8,6 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
-from distrace.bench import poster_view
 from distrace.cli.common import Flag
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
@@ -18,6 +17,7 @@ from distrace.data.samples import Doubt
 from distrace.data.solid import Solid, normalised
 from distrace.data.split import every_mesh, read_split
 from distrace.data.view import pictured
+from distrace.evaluation.bench import poster_view
 from distrace.files import written
 from distrace.shading import in_rows, save_png
 

@@ -8,14 +8,15 @@ from typing import Annotated
 
 import tyro
 
-from distrace import pose_table, shading
+from distrace import shading
 from distrace.cli.common import Meshes, ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
 from distrace.cli.evaluate_data import Card, Choices, Splits
 from distrace.cli.evaluate_depth import Focal, Multiview, Noise, SparseDepth, Spread
 from distrace.cli.evaluate_photographs import Photographs
 from distrace.data.split import on_side
-from distrace.evaluate import (
+from distrace.evaluation import pose_table
+from distrace.evaluation.evaluate import (
     Result,
     completion_results,
     held_out_results,
@@ -24,9 +25,9 @@ from distrace.evaluate import (
     training_results,
 )
 from distrace.files import save_json, save_text
-from distrace.fit_code import CodeFitConfig
-from distrace.methods import METHODS
-from distrace.page import figure, page, section, table
+from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.methods import METHODS
+from distrace.pages.page import figure, page, section, table
 from distrace.processes import each_done
 
 SHORT = {

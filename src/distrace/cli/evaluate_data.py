@@ -3,14 +3,14 @@
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from distrace.card import pairs_picture, shapes_table, walks_picture
 from distrace.cli.common import Meshes, ModelName, opened, show_table
 from distrace.cli.console import console, origin, progress, start
 from distrace.data.split import CLASSES, read_split
+from distrace.evaluation.card import pairs_picture, shapes_table, walks_picture
+from distrace.evaluation.split_table import nearest_rows, used
+from distrace.evaluation.training_choices import choice_rows, choices_with
 from distrace.files import save_json, save_text
 from distrace.shading import save_png
-from distrace.split_table import nearest_rows, used
-from distrace.training_choices import choice_rows, choices_with
 
 
 @dataclass(frozen=True)

@@ -8,19 +8,28 @@ from statistics import median
 
 import tyro
 
-from distrace import depth_tables
 from distrace.cli.common import Meshes, show_table
 from distrace.cli.console import console, origin, progress, start
-from distrace.clip_page import save_clip_page
 from distrace.data.split import CLASSES
+from distrace.evaluation import depth_tables
+from distrace.evaluation.clip_page import save_clip_page
+from distrace.evaluation.focal_test import look_rows, looks
+from distrace.evaluation.multiview_table import METHODS as METHODS_OF_CLIPS
+from distrace.evaluation.multiview_table import ClipTrial, clip_done, described, multiview_rows, settings_of
+from distrace.evaluation.sparse_depth import (
+    AZIMUTHS_ELEVATIONS,
+    CONDITIONS,
+    Done,
+    Place,
+    Trial,
+    all_trials,
+    done,
+    held_out,
+)
+from distrace.evaluation.spread_table import spread_rows
 from distrace.files import save_text
-from distrace.focal_test import look_rows, looks
-from distrace.methods import METHODS
-from distrace.multiview_table import METHODS as METHODS_OF_CLIPS
-from distrace.multiview_table import ClipTrial, clip_done, described, multiview_rows, settings_of
+from distrace.fitting.methods import METHODS
 from distrace.processes import each_done
-from distrace.sparse_depth import AZIMUTHS_ELEVATIONS, CONDITIONS, Done, Place, Trial, all_trials, done, held_out
-from distrace.spread_table import spread_rows
 
 
 @dataclass(frozen=True)

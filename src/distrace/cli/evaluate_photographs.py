@@ -8,7 +8,7 @@ import tyro
 from distrace.cli.common import show_table
 from distrace.cli.console import origin, start
 from distrace.cli.reconstruct import Reconstruct
-from distrace.trials import read_json
+from distrace.evaluation.trials import read_json
 
 METHODS = ("ours", "hull")
 

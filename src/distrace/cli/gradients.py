@@ -6,9 +6,9 @@ from pathlib import Path
 
 import tyro
 
+from distrace.checking.gradcheck import STRAY, GradientRow, check_gradients
 from distrace.cli.common import ModelName, opened, orbiting, show_table
 from distrace.cli.console import console, origin, start
-from distrace.gradcheck import STRAY, GradientRow, check_gradients
 
 
 @dataclass(frozen=True)

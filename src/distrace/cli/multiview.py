@@ -13,15 +13,15 @@ from distrace.checkpoint import Model
 from distrace.cli.common import Flag, ModelName, Views, opened, save_mesh
 from distrace.cli.console import console, progress, start
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
-from distrace.doubtful import Agreement, agreements
 from distrace.files import save_text, written
-from distrace.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
-from distrace.photo_residuals import Shape
-from distrace.photo_stage import Comparing
-from distrace.prior import prior_of
-from distrace.views_page import forming, views_page
+from distrace.pages.views_page import forming, views_page
+from distrace.photographs.doubtful import Agreement, agreements
+from distrace.photographs.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.photographs.photo_residuals import Shape
+from distrace.photographs.photo_stage import Comparing
 
 
 @dataclass(frozen=True)

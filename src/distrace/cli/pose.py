@@ -16,7 +16,7 @@ from distrace.cli.console import Run, console, progress, start
 from distrace.data.view import View, read_view, save_view
 from distrace.errors import explained
 from distrace.field import SDF
-from distrace.fit_camera import CameraConfig, CameraStep, fit_camera
+from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render
 

@@ -15,13 +15,13 @@ from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
 from distrace.files import save_json
-from distrace.hull import Overlap, overlaps
 from distrace.mesh import MeshConfig
-from distrace.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
-from distrace.reconstruction_page import judged
-from distrace.reconstruction_run import load_reconstruction, mark, save_reconstruction
+from distrace.pages.reconstruction_page import judged
+from distrace.photographs.hull import Overlap, overlaps
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
+from distrace.reconstruction.reconstruction_run import load_reconstruction, mark, save_reconstruction
+from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.shading import save_png
-from distrace.surface_network import SurfaceSpecs
 
 PREVIEWS = 40  # of a run, evenly over its steps; they make its film
 PREVIEWED = 160  # pixels along the longer side

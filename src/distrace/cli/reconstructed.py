@@ -17,11 +17,11 @@ from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
 from distrace.mesh import MeshConfig
-from distrace.motions import between, drift, motions, moved, relative
 from distrace.movie import save_gif
-from distrace.reconstruct import ReconstructConfig, Reconstruction
-from distrace.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
-from distrace.registration import registered
+from distrace.pages.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.reconstruction.motions import between, drift, motions, moved, relative
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
+from distrace.reconstruction.registration import registered
 from distrace.shading import grid, save_png
 
 TOLD = 4  # views that were fitted to, on the page

@@ -17,8 +17,8 @@ from distrace.data.view import save_view
 from distrace.field import Counted
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
+from distrace.pages.report import View
 from distrace.render import STRATEGIES, Buffers, Config
-from distrace.report import View
 from distrace.shading import Picture
 from distrace.trace import Outcome, Trace, TraceConfig
 

@@ -10,23 +10,23 @@ from typing import Any
 import torch
 import tyro
 
-from distrace.bench import poster_view
-from distrace.charts import save_course
 from distrace.checkpoint import Model, save_experiment
 from distrace.cli.common import opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
-from distrace.course import COURSE
 from distrace.data import sampling
 from distrace.data.split import every_mesh, has_meshes, on_side
 from distrace.decoder import NetworkSpecs
+from distrace.evaluation.bench import poster_view
+from distrace.pages.charts import save_course
+from distrace.pages.report import View
 from distrace.render import render
-from distrace.report import View
-from distrace.resume import load_training, save_training
 from distrace.shading import save_png, side_by_side
-from distrace.train import Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
-from distrace.train import start as start_training
-from distrace.train import train as run_training
+from distrace.training.course import COURSE
+from distrace.training.resume import load_training, save_training
+from distrace.training.train import Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
+from distrace.training.train import start as start_training
+from distrace.training.train import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
 TRIED = 20  # steps that tell how many fit into --minutes

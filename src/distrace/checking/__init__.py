@@ -1,0 +1,1 @@
+"""Derivatives of images held against finite differences, and against those of DIST."""

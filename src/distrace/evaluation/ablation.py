@@ -1,0 +1,92 @@
+"""The rows of the benchmark of tracing: the strategies of DIST, what its original code costs, and fast."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.checkpoint import Model
+from distrace.evaluation.bench import Case, reference_depth
+from distrace.field import SDF
+from distrace.rays import Bounds, meet_sphere
+from distrace.render import STRATEGIES, Buffers, Config, render
+from distrace.trace import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
+
+NAIVE_RAYS = 100  # of which the row `naive` is a sample
+ORIGINAL_BATCH = 100_000  # points
+COUNT = 10  # of rows
+TURN = 10.0  # degrees to the next view
+STEP_DEGREES, STEP_CODE = 1.0, 0.01  # what a step of an optimisation moves: the camera, the code relative to its length
+
+
+def of_field(
+    sdf: SDF, camera: Camera, strategies: Mapping[str, Config] = STRATEGIES, radius: float = 1.0
+) -> Iterator[Case]:
+    """One ray after another (a sample of them), and the strategies, on one view of any field."""
+    truth = reference_depth(sdf, camera, radius)
+    yield _naive(sdf, camera, truth, radius)
+    for name, config in strategies.items():
+        yield Case(name, lambda config=config: render(sdf, camera, radius=radius, config=config), truth)
+
+
+def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
+    """The ablation on a decoder; what the original costs; and what fast costs once an image of the shape is there."""
+    sdf, latent = model.field(code), model.codes[code]
+    cases = list(of_field(sdf, camera))
+    yield from cases[:-1]
+    yield Case("original", lambda: _original(model, latent, camera), cases[-1].truth)
+    yield cases[-1]
+    first = render(sdf, camera)
+    aside, nudged = camera.turned(TURN), camera.turned(STEP_DEGREES)
+    yield Case("fast_next", lambda: render(sdf, aside, lattice=first.lattice), reference_depth(sdf, aside))
+    yield Case(
+        "fast_camera",
+        lambda: render(sdf, nudged, lattice=first.lattice, last=first.trace),
+        reference_depth(sdf, nudged),
+    )
+    moved = model.field(latent + STEP_CODE * latent.norm() * _direction(latent))
+    yield Case("fast_code", lambda: render(moved, camera, last=first.trace), reference_depth(moved, camera))
+
+
+def _naive(sdf: SDF, camera: Camera, truth: Tensor, radius: float) -> Case:
+    """One ray after another, each for all of its steps."""
+    rays, cosines = camera.rays().flat(), camera.cosines().reshape(-1)
+    bounds = meet_sphere(rays, radius)
+    entering = bounds.meets.nonzero()[:, 0]
+    chosen = entering[torch.randperm(len(entering), generator=torch.Generator().manual_seed(0))[:NAIVE_RAYS]]
+    some = Bounds(bounds.near[chosen], bounds.far[chosen])
+
+    def alone(k: int) -> Trace:
+        ray, part = rays[chosen[k : k + 1]], Bounds(some.near[k : k + 1], some.far[k : k + 1])
+        trace = sphere_trace(sdf, ray, part, PARALLEL)
+        for _ in range(int(trace.evaluations), PARALLEL.steps):
+            sdf(ray.at(trace.stopped))
+        return replace(trace, evaluations=torch.full_like(trace.evaluations, PARALLEL.steps))
+
+    def render_each() -> Buffers:
+        traces = [alone(k) for k in range(len(chosen))]
+        images = {name: torch.cat([trace.images()[name] for trace in traces]) for name in traces[0].images()}
+        return Buffers(sdf, rays[chosen], cosines[chosen], replace(traces[0], **images), radius)
+
+    return Case("naive", render_each, truth.reshape(-1)[chosen], len(chosen) / len(entering))
+
+
+def _original(model: Model, code: Tensor, camera: Camera) -> Buffers:
+    """Coarse-to-fine as the original code runs it: each point with its own copy of the code, and a last query of the
+    least |f| on every ray, also where it hit."""
+
+    def sdf(points: Tensor) -> Tensor:
+        return torch.cat([model.decoder(part, code.expand(len(part), -1)) for part in points.split(ORIGINAL_BATCH)])
+
+    buffers = render(sdf, camera, config=COARSE_TO_FINE)
+    met = torch.isfinite(buffers.trace.closest)
+    sdf(buffers.rays[met].at(buffers.trace.closest[met]))
+    return replace(buffers, trace=replace(buffers.trace, evaluations=buffers.trace.evaluations + met))
+
+
+def _direction(like: Tensor) -> Tensor:
+    """A random one, the same each time."""
+    direction = torch.randn(like.shape, generator=torch.Generator().manual_seed(0)).to(like)
+    return direction / direction.norm()

@@ -1,0 +1,121 @@
+"""How the cost of fast grows: with the size of the image, of the field, and with the number of views."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+import torch
+from torch import nn
+
+from distrace.camera import Camera
+from distrace.checkpoint import load_model
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.evaluation.bench import in_turn, poster_view
+from distrace.field import SDF
+from distrace.movie import turntable
+from distrace.render import STRATEGIES, Buffers, render
+
+BOTH = ("fast", "coarse_to_fine")
+MEASURED = (1024, 2048, 4096)  # pixels along each side, for which memory is measured
+SIZES = (64, 128, 256, 512, 1024, 2048)  # pixels along each side
+NETWORKS = ((4, 128), (4, 256), (8, 256), (8, 512))  # layers × width
+VIEWS = (1, 2, 4, 8, 16)
+COUNT = 23  # of rows
+RADIUS = 0.6  # of the shape of untrained networks
+
+
+@dataclass(frozen=True)
+class GrowthRow:
+    """What one image cost, or several views of one shape together. Times are medians, of runs in turn."""
+
+    axis: str
+    value: str
+    strategy: str
+    visible: int
+    queries: int
+    per_pixel: float
+    seconds: float
+    runs: int
+
+
+def by_size(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
+    """Fast and coarse-to-fine on the poster's view; the latter up to 512 pixels, where it takes most of a minute."""
+    for size in SIZES:
+        strategies = BOTH if size <= 512 else BOTH[:1]
+        yield from _rows("pixels", f"{size}", sdf, [poster_view(size)], strategies, repeats)
+
+
+def by_network(repeats: int) -> Iterator[GrowthRow]:
+    """Untrained networks whose surface is about a sphere."""
+    for layers, width in NETWORKS:
+        yield from _rows("network", f"{layers} × {width}", ball(layers, width), [poster_view(256)], BOTH, repeats)
+
+
+def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
+    """Views around a shape, each with the lattice of the first."""
+    for count in VIEWS:
+        cameras = turntable(poster_view(256), count) if count > 1 else [poster_view(256)]
+        yield from _rows("views", f"{count}", sdf, cameras, BOTH[:1], repeats)
+
+
+def ball(layers: int, width: int) -> SDF:
+    """The field of a network before any training."""
+    specs = NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=())
+    return ball_decoder(specs, RADIUS).field(torch.zeros(1))
+
+
+def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
+    """About the distance to a sphere before any training (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+    decoder = Decoder(specs)
+    generator = torch.Generator().manual_seed(0)
+    linears = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
+    with torch.no_grad():
+        for linear in linears[:-1]:
+            linear.weight.normal_(0, (2 / linear.out_features) ** 0.5, generator=generator)
+            linear.bias.zero_()
+        linears[-1].weight.normal_((torch.pi / linears[-1].in_features) ** 0.5, 1e-5, generator=generator)
+        linears[-1].bias.fill_(-radius)
+    return decoder.requires_grad_(False)
+
+
+def _rows(
+    axis: str, value: str, sdf: SDF, cameras: list[Camera], strategies: tuple[str, ...], repeats: int
+) -> Iterator[GrowthRow]:
+    counted: dict[str, tuple[int, int]] = {}
+
+    def run(strategy: str) -> Buffers:
+        views, lattice = [], None
+        for camera in cameras:
+            views.append(render(sdf, camera, config=STRATEGIES[strategy], lattice=lattice))
+            lattice = views[-1].lattice
+        counted[strategy] = sum(int(v.mask.sum()) for v in views), sum(v.trace.total_evaluations for v in views)
+        return views[-1]
+
+    results = in_turn({name: partial(run, name) for name in strategies}, repeats)
+    for name, (_, seconds, runs) in results.items():
+        visible, queries = counted[name]
+        yield GrowthRow(axis, value, name, visible, queries, queries / max(visible, 1), seconds, runs)
+
+
+def peak_memory(model: str, code: int, size: int) -> float:
+    """MiB that rendering the poster's view at a size takes beyond what was there before; in a process of its own."""
+    with get_context("spawn").Pool(1) as pool:
+        return pool.apply(_peak, (model, code, size))
+
+
+def _peak(model: str, code: int, size: int) -> float:
+    field = load_model(model).field(code)
+    with torch.no_grad():
+        render(field, poster_view(32))
+        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+        before = _memory("VmRSS")
+        _ = render(field, poster_view(size)).depth
+    return _memory("VmHWM") - before
+
+
+def _memory(what: str) -> float:
+    """MiB, as Linux has it."""
+    lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    return int(lines[what].split()[0]) / 1024

@@ -1,0 +1,1 @@
+"""A code, or a camera, found from depths, silhouettes, points or signed samples."""

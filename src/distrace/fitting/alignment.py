@@ -1,0 +1,174 @@
+"""How far a known shape before a camera is from what was observed: residuals along rays and their exact Jacobian."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from distrace.camera import Camera
+from distrace.fast.forecast import Kind, forecast
+from distrace.fast.lattice import Lattice
+from distrace.fast.passes import LATTICE_DOUBT
+from distrace.fast.roots import Guess, settle
+from distrace.fast.tracer import near_surface, prepared
+from distrace.field import SDF, value_and_gradient
+from distrace.fitting.sight import Sight
+from distrace.fitting.solver import Residuals
+from distrace.pose import object_in_camera
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.surface import minimum
+from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
+
+APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
+CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
+REACH = 0.05  # for the least value on a ray: then to a fifth of that, and to a fifth of that
+CLOSE = 3e-4  # enough for a step of the solver
+MARCH = TraceConfig(coarse_levels=0, step_scale=1.2, tolerance=CLOSE, steps=30, least_step=1e-3)
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """What deviations count alike: of depths and outlines in units of the unit sphere, of normals in radians."""
+
+    depth: float = 0.01
+    outline: float = 0.01
+    normal: float = 0.2
+
+
+@dataclass(frozen=True)
+class Still:
+    """A shape that stays as it is, with the lattice that tells where its surface may be."""
+
+    sdf: SDF
+    near: SDF
+    lattice: Lattice
+
+    @staticmethod
+    def of(sdf: SDF, like: Tensor) -> "Still":
+        lattice, _ = prepared(sdf, like)
+        return Still(sdf, near_surface(sdf, lattice), lattice)
+
+    @torch.no_grad()
+    def trace(self, rays: Rays, bounds: Bounds) -> Trace:
+        """Rays with a clear root are settled there, those that may meet the surface are marched, others pass by."""
+        within = self.lattice.within(rays, bounds)
+        ahead = forecast(self.lattice, rays, within.near, within.far)
+        guess = Guess(ahead.distance, ahead.slope, torch.full_like(ahead.slope, LATTICE_DOUBT))
+        root = (ahead.kind == Kind.ROOT) & (ahead.begins > bounds.near)
+        settled = settle(self.lattice.near, rays[root], guess[root], CLOSE, self.lattice.cell)
+        distance = torch.full_like(ahead.distance, torch.inf)
+        distance[root] = settled.distance.nan_to_num(torch.inf)
+        left = (ahead.kind != Kind.NOTHING) & ~distance.isfinite()
+        some = Bounds(bounds.near.masked_fill(~left, torch.inf), bounds.far)
+        trace = sphere_trace(self.lattice.near, rays, some, MARCH, ahead.begins)
+        outcome = trace.outcome.masked_fill(distance.isfinite(), int(Outcome.HIT))
+        middle = -(rays.origins * rays.directions).sum(-1).clamp_max(0)  # beside the middle, where no more is known
+        passed = torch.where(ahead.closest.isfinite(), ahead.closest, middle)
+        closest = torch.where(left, trace.closest, passed)
+        return Trace(distance.minimum(trace.distance), outcome, closest, closest, trace.evaluations)
+
+
+@torch.no_grad()
+def residuals(shape: Still, sight: Sight, camera: Camera, accuracy: Accuracy, *, focal: bool) -> Residuals:
+    """Of all rays that disagree, by how the shape turns and shifts before the camera (and the log of its focal length).
+
+    A depth is off by (z − z_observed) · |∇f · v|: how far the surface is from the observed point. A ray that should hit
+    is off by the least value of f on it. One that should miss is off by as far as its hit lies from the object that was
+    observed, across the view; where the outline itself is on the ray, by the least value, closely, too.
+    """
+    rays, cosines = camera.rays(sight.pixels), camera.cosines(sight.pixels)
+    bounds = meet_sphere(rays)
+    trace = shape.trace(rays, bounds)
+    beyond = sight.is_background & trace.hit & (sight.outside.norm(dim=-1) > 0)
+    lacking = torch.where(trace.hit, sight.is_background & ~beyond, sight.is_object)
+    astray = lacking & ~bounds.meets
+    seen = trace.hit & ~sight.is_background
+    t = torch.where(trace.hit, trace.distance, trace.closest)
+    low = lacking & sight.is_object & sight.is_background & bounds.meets  # others need not be known so closely
+    some = Bounds(bounds.near[low], bounds.far[low])
+    t[low] = minimum(shape.sdf, rays[low], t[low], some, reach=REACH, refine=2)
+    rows = (lacking | beyond | seen).nonzero()[:, 0]
+    here = _Here.of(shape.near, camera, rays[rows], t[rows], astray[rows], focal=focal)
+    off = (t * cosines - sight.depth)[rows] * here.slope / cosines[rows]
+    parts = [
+        here.part(here.value, lacking[rows], accuracy.outline),
+        here.part(off, (seen & sight.depth.isfinite())[rows], accuracy.depth),
+        here.across(sight.outside[rows], beyond[rows], camera, accuracy.outline),
+        here.normals(shape.near, sight.normal[rows], (seen & sight.has_normal)[rows], accuracy.normal),
+    ]
+    values, jacobian = (torch.cat(part) for part in zip(*parts))
+    weights = torch.full_like(values, 1 / len(sight.pixels))
+    weights[len(values) - len(parts[-1][0]) :] /= 3  # of a normal's three parts
+    return Residuals(values, jacobian, weights)
+
+
+@dataclass(frozen=True)
+class _Here:
+    """Points on rays, and how the points of the shape there move before the camera, by each unknown."""
+
+    points: Float[Tensor, "n 3"]  # in the world …
+    seen: Float[Tensor, "n 3"]  # … and in the camera's axes
+    directions: Float[Tensor, "n 3"]
+    value: Float[Tensor, "n"]
+    gradient: Float[Tensor, "n 3"]
+    rotation: Float[Tensor, "3 3"]  # from world to camera
+    motion: Float[Tensor, "n 3 unknowns"]  # in the camera's axes
+
+    @staticmethod
+    def of(sdf: SDF, camera: Camera, rays: Rays, t: Tensor, astray: Tensor, *, focal: bool) -> "_Here":
+        """Where rays go astray the field is unknown; there it is a ball's."""
+        rotation, translation = object_in_camera(camera)
+        points = rays.at(t)
+        value, gradient = value_and_gradient(sdf, points)
+        value = torch.where(astray, points.norm(dim=-1) - CORE, value)
+        gradient = torch.where(astray[:, None], normalize(points, dim=-1), gradient)
+        from_middle = points @ rotation.T
+        axes = torch.eye(3).to(points).expand(len(points), 3, 3)
+        columns = [_crossed(axes, from_middle), axes]
+        if focal:
+            columns.append(((from_middle + translation) * points.new_tensor([1.0, 1.0, 0.0]))[:, :, None])
+        motion = torch.cat(columns, dim=2)
+        return _Here(points, from_middle + translation, rays.directions, value, gradient, rotation, motion)
+
+    @property
+    def slope(self) -> Float[Tensor, "n"]:
+        return (self.gradient * self.directions).sum(-1).abs()
+
+    def part(self, values: Tensor, where: Bool[Tensor, "n"], scale: float) -> tuple[Tensor, Tensor]:
+        """Residuals that change as the field does at a fixed point: by −∇f · motion."""
+        gradient = self.gradient[where] @ self.rotation.T
+        return values[where] / scale, -torch.einsum("nk,nku->nu", gradient, self.motion[where]) / scale
+
+    def across(self, outside: Tensor, where: Bool[Tensor, "n"], camera: Camera, scale: float) -> tuple[Tensor, Tensor]:
+        """How far points are from the observed object, at their depth and parallel to the image."""
+        seen, motion, z = self.seen[where], self.motion[where], self.seen[where, 2:]
+        away, away_by = outside[where].norm(dim=-1), normalize(outside[where], dim=-1)
+        lateral = motion[:, :2] - (seen[:, :2] / z)[:, :, None] * motion[:, 2:]
+        values = away * z[:, 0] / camera.intrinsics[0, 0]
+        return values / scale, torch.einsum("nk,nku->nu", away_by, lateral) / scale
+
+    def normals(self, sdf: SDF, observed: Tensor, where: Bool[Tensor, "n"], scale: float) -> tuple[Tensor, Tensor]:
+        """Differences of normals in the camera's axes; they turn with the shape, and as the hit slides over its bends.
+
+        Bends are differences over APART: a ReLU network has none but at its facets' edges.
+        """
+        normal, ray = normalize(self.gradient[where], dim=-1), self.directions[where]
+        side = normalize(torch.linalg.cross(normal, normal.roll(1, -1) + 0.1), dim=-1)
+        tangents = torch.stack([side, torch.linalg.cross(normal, side)], dim=1)
+        _, around = value_and_gradient(sdf, self.points[where, None] + APART * torch.cat([tangents, -tangents], dim=1))
+        ahead, behind = normalize(around, dim=-1).split(2, dim=1)
+        motion = -torch.einsum("kj,nku->nju", self.rotation, self.motion[where])  # of a fixed point over the shape
+        along = torch.einsum("nj,nju->nu", normal, motion) / (normal * ray).sum(-1).clamp_max(-0.05)[:, None]
+        slid = torch.einsum("nsj,nju->nsu", tangents, motion - ray[:, :, None] * along[:, None])
+        bent = torch.einsum("nsj,nsu->nju", (ahead - behind) / (2 * APART), slid)
+        change = torch.einsum("ij,nju->niu", self.rotation, bent)
+        seen = normal @ self.rotation.T
+        change[:, :, :3] += _crossed(torch.eye(3).to(seen).expand(len(seen), 3, 3), seen)
+        return ((seen - observed[where]) / scale).flatten(), (change / scale).flatten(0, 1)
+
+
+def _crossed(axes: Float[Tensor, "n 3 3"], vectors: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
+    """By each axis of rotation, as columns: axis × vector."""
+    return torch.linalg.cross(axes, vectors[:, None]).transpose(1, 2)

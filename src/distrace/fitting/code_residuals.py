@@ -1,0 +1,197 @@
+"""What the shape of a code lacks of observed views: residuals on rays, and their exact derivatives by the code."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.field import Counted
+from distrace.fitting.prior import Prior
+from distrace.fitting.solver import Residuals
+from distrace.fitting.targets import Targets
+from distrace.losses import Weights
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.surface import minimum
+from distrace.trace import TraceConfig, sphere_trace
+
+BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
+ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
+WATCHED = 0.075  # … and those that come closer than this are looked at after each step, …
+WINDOW = 0.1  # … so far before and behind where they came closest; the others when a stage begins
+REACH, ROUNDS = 0.05, 2  # … to two thousandths
+GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
+SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
+PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What deviations count: as in Adam's loss."""
+
+    weights: Weights = Weights()
+    margin: float = 0.005  # how far the surface is to stay from rays of the background
+    trace: TraceConfig = field(
+        default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
+    )
+
+
+@dataclass(frozen=True)
+class Seen:
+    """Rays of all views, and what was seen there. A weight is a ray's share of its term of the loss."""
+
+    rays: Rays
+    bounds: Bounds
+    observed: Float[Tensor, "n"]  # distance; `inf` where unknown
+    is_object: Bool[Tensor, "n"]
+    weights: Float[Tensor, "n"]
+
+    @staticmethod
+    def of(targets: Sequence[Targets], weights: Weights) -> "Seen":
+        parts = []
+        for target in targets:
+            rays, known = target.camera.rays(target.pixels), target.depth.isfinite()
+            depth, mask = weights.depth / max(int(known.sum()), 1), weights.mask / max(len(known), 1)
+            share = torch.where(known, depth, mask) / len(targets)
+            observed = target.depth / target.camera.cosines(target.pixels)
+            parts.append((rays.origins, rays.directions, observed, target.is_object, share))
+        origins, directions, observed, is_object, share = (torch.cat(part) for part in zip(*parts))
+        rays = Rays(origins, directions)
+        return Seen(rays, meet_sphere(rays), observed, is_object, share)
+
+    @property
+    def known(self) -> Bool[Tensor, "n"]:
+        return self.observed.isfinite()
+
+    def __getitem__(self, rows: Tensor) -> "Seen":
+        bounds = Bounds(self.bounds.near[rows], self.bounds.far[rows])
+        return Seen(self.rays[rows], bounds, self.observed[rows], self.is_object[rows], self.weights[rows])
+
+
+@dataclass(frozen=True)
+class Look:
+    """Code coordinates, and where along the rays their shape is compared with what was seen."""
+
+    w: Float[Tensor, "dimensions"]
+    distance: Float[Tensor, "n"]
+    hit: Bool[Tensor, "n"]
+    compared: Bool[Tensor, "n"]
+    watched: Bool[Tensor, "n"]  # compared, or near to that: what a step may change
+
+
+@dataclass
+class Problem:
+    """Residuals of a code's coordinates on fixed rays; and how often all that has asked for the field."""
+
+    decoder: Decoder
+    prior: Prior
+    seen: Seen
+    config: Comparison
+    scale: float = 0.02  # up to which deviations count by their squares
+    evaluations: int = 0
+
+    @torch.no_grad()
+    def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
+        """Along all rays; those that ended on the surface last are followed from there on."""
+        near, far = self.seen.bounds.near, self.seen.bounds.far
+        if last is not None:
+            near = torch.where(last.hit | self.seen.known, last.distance - BACK, near)
+        return self._look(w, self.seen, Bounds(near, far))
+
+    @torch.no_grad()
+    def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
+        """Along the rays that are watched, about where they ended last; the others stay as they were."""
+        rows = look.watched.nonzero()[:, 0]
+        seen, t, known = self.seen[rows], look.distance[rows], self.seen.known[rows]
+        near = (t - torch.where(known | look.hit[rows], BACK, WINDOW)).maximum(seen.bounds.near)
+        part = self._look(look.w + step, seen, Bounds(near, (t + WINDOW).minimum(seen.bounds.far)))
+        whole = (look.distance.clone(), look.hit.clone(), look.compared.clone())
+        for image, new in zip(whole, (part.distance, part.hit, part.compared), strict=True):
+            image[rows] = new
+        return Look(part.w, *whole, look.watched)
+
+    def _look(self, w: Float[Tensor, "dimensions"], seen: Seen, within: Bounds) -> Look:
+        """Rays with a depth are followed no farther than that.
+
+        Of the others those that disagree with the mask are compared, where the field is least; those that are near to
+        that are watched.
+        """
+        sdf, known = Counted(self.decoder.field(self.prior.code(w))), seen.known
+        far = torch.where(known, seen.observed.minimum(seen.bounds.far), within.far)
+        trace = sphere_trace(sdf, seen.rays, Bounds(seen.bounds.near, far), self.config.trace, within.near)
+        t = torch.where(trace.hit | ~known, trace.closest, seen.observed)
+        free = ~known & ~seen.is_object & seen.bounds.meets
+        aside = (free & ~trace.hit).nonzero()[:, 0]
+        values = sdf(seen.rays[aside].at(t[aside]))
+        close = free.clone()
+        free[aside], close[aside] = values < ATTENTION, values < WATCHED
+        lacking = ~known & seen.is_object & seen.bounds.meets & ~trace.hit
+        wrong = free | lacking
+        some = seen[wrong]
+        t[wrong] = minimum(sdf, some.rays, t[wrong], some.bounds, reach=REACH, refine=ROUNDS)
+        self.evaluations += sdf.evaluations
+        return Look(w, t, trace.hit, known | wrong, known | close | lacking)
+
+    def residuals(self, look: Look) -> Residuals:
+        """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
+
+        Of a depth that is the field at the observed point over |∇f · v| there or, where the surface hides that point,
+        t − t_observed; of an object ray that misses the least value; of a ray of the background what that lacks to the
+        margin. All change with the code as f does at a fixed point.
+        """
+        seen, rows = self.seen, look.compared.nonzero()[:, 0]
+        rays, t = seen.rays[rows], look.distance[rows]
+        values, gradient, by_code = derivatives(self.decoder, rays.at(t), self.prior.code(look.w))
+        self.evaluations += len(values)
+        slope, known = (gradient * rays.directions).sum(-1).abs(), seen.known[rows]
+        before = torch.where(known, t - seen.observed[rows], 0.0)
+        lacking = torch.where(seen.is_object[rows], values.clamp_min(0), (values - self.config.margin).clamp_max(0))
+        along = torch.where(known, 1 / slope.clamp_min(GRAZING), 1.0)
+        values = torch.where(known, values + before * slope, lacking) * along
+        jacobian = (by_code @ self.prior.basis * along[:, None]).masked_fill((values == 0)[:, None], 0.0)
+        weights = seen.weights[rows] / self.scale
+        return with_prior(values, jacobian, weights, look.w, self.config.weights.code)
+
+    def terms(self, look: Look, residuals: Residuals) -> dict[str, float]:
+        """The parts of Adam's loss, its depths measured from the surface: what of all scales can be compared."""
+        rows = look.compared.nonzero()[:, 0]
+        known, is_object = self.seen.known[rows], self.seen.is_object[rows]
+        lacking = residuals.values[: len(rows)].abs() * self.seen.weights[rows]
+        kinds = {"depth": known, "missing": ~known & is_object, "extra": ~known & ~is_object}
+        code = self.config.weights.code * look.w.square().mean()
+        return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
+
+
+def with_prior(
+    values: Float[Tensor, "n"],
+    jacobian: Float[Tensor, "n dimensions"],
+    weights: Float[Tensor, "n"],
+    w: Float[Tensor, "dimensions"],
+    weight: float,
+) -> Residuals:
+    """With residuals for the prior, whose loss is weight × the mean squared coordinate."""
+    count = len(w)
+    return Residuals(
+        torch.cat([values, SMALL * w]),
+        torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
+        torch.cat([weights, values.new_full((count,), 2 * weight / count / SMALL**2)]),
+    )
+
+
+def derivatives(
+    decoder: Decoder, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
+    """Values, and their derivatives by the point and by the code: every point has a copy of the code for its own."""
+    parts = [_derivatives(decoder, part, code) for part in points.split(PART)]
+    values, by_point, by_code = (torch.cat(part) for part in zip(*parts))
+    return values, by_point, by_code
+
+
+@torch.enable_grad()
+def _derivatives(decoder: Decoder, points: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    points, codes = points.detach().requires_grad_(), code.detach().repeat(len(points), 1).requires_grad_()
+    values = decoder(points, codes)
+    by_point, by_code = torch.autograd.grad(values.sum(), (points, codes))
+    return values.detach(), by_point, by_code

@@ -1,0 +1,157 @@
+"""Fitting a shape's code by Levenberg–Marquardt, to views or to points: a tenth of Adam's steps, hardly dearer ones."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.data.view import View
+from distrace.decoder import FAR, Decoder
+from distrace.field import SDF, Counted
+from distrace.fitting.code_residuals import Comparison, Problem, Seen
+from distrace.fitting.fit import pools_of
+from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
+from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
+from distrace.fitting.prior import Prior
+from distrace.fitting.solver import Kernel, SolverConfig, cauchy, charbonnier, minimise
+from distrace.fitting.starts import Starts, Step, best_of, stages_of
+from distrace.fitting.targets import drawn
+from distrace.fitting.verdict import contradiction
+from distrace.losses import Weights
+
+ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
+
+
+@dataclass(frozen=True)
+class CodeFitConfig(Starts):
+    """Steps in stages, in which deviations beyond a scale count less.
+
+    In the first stages, whose scale narrows, by their absolute values; in the last ones hardly.
+    """
+
+    iterations: int = 16
+    kept: int = 3  # all of three starts: what a few iterations reach says little about the end
+    stages: int = 4
+    depth_rays: int = 1000  # of each view
+    mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates
+    first_share: float = 0.3  # of them, in the first stage: while all is coarse
+    compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
+    scale: float = 0.02  # at first: what is far off is no outlier …
+    narrowing: float = 0.42  # … and × this from one stage to the next
+    outlying: float = 0.01  # the scale of the last stages …
+    robust: int = 2  # … and how many these are
+    damping: float = 0.1
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.stages < 1:
+            raise ValueError(f"{self.stages} stages were asked for; there must be at least 1")
+
+    def scale_and_kernel(self, stage: int) -> tuple[float, Kernel]:
+        """A stage's scale, and how what is beyond it counts."""
+        if stage >= self.stages - self.robust:
+            return self.outlying, cauchy
+        return self.scale * self.narrowing**stage, charbonnier
+
+
+def fit_code(
+    decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
+) -> Iterator[Step]:
+    """Fits a code to views, from several starts; the end that contradicts the views least is the last step again.
+
+    Raises `ValueError` without views, or with one from inside the mean shape.
+    """
+    pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
+
+    def seen(random: torch.Generator, depths: int, silhouette: int) -> Seen:
+        return Seen.of([pool.draw(depths, silhouette, random) for pool in pools], config.compared.weights)
+
+    def problem(random: torch.Generator, share: float) -> Problem:
+        some = seen(random, config.depth_rays, round(config.mask_rays * share))
+        return Problem(decoder, prior, some, config.compared)
+
+    others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
+
+    def verdict(sdf: SDF, step: Step) -> float:
+        return contradiction(sdf, others, config.compared.trace)
+
+    random = torch.Generator().manual_seed(config.seed)
+    return _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
+
+
+def fit_points(
+    decoder: Decoder, samples: Float[Tensor, "n 4"], prior: Prior, config: CodeFitConfig = CodeFitConfig()
+) -> Iterator[Step]:
+    """Fits a code to points and their signed distances, which are 0 on the surface, as `fit_code` does to views.
+
+    The end that is nearest to all of them is the last step again. A list of distances should tell where nothing is,
+    too: points far from the surface are compared only where a fit has come too near to them.
+
+    Raises `ValueError` without points.
+    """
+    if not len(samples):
+        raise ValueError("no points were given; fitting needs points with their signed distances")
+
+    def problem(random: torch.Generator, share: float) -> PointProblem:
+        count = config.depth_rays + round(config.mask_rays * share)
+        return PointProblem(decoder, prior, samples, count, random, weights)
+
+    def verdict(sdf: SDF, step: Step) -> float:
+        return weights.depth * misfit(sdf, others) + step.terms["code"]
+
+    random, weights = torch.Generator().manual_seed(config.seed), config.compared.weights
+    near = samples[samples[:, 3].abs() < FAR]
+    some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
+    others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
+    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config, verdict)
+
+
+def _best(
+    decoder: Decoder,
+    prior: Prior,
+    hints: Hints,
+    problem_of: ProblemOf,
+    config: CodeFitConfig,
+    verdict: Callable[[SDF, Step], float],
+) -> Iterator[Step]:
+    """From all starts; the first step is charged with the search for them. The least verdict's end is the best."""
+    first = first_of(decoder, prior, hints, config.starts, config.seed)
+
+    def run(start: int) -> Iterator[Step]:
+        return _solved(problem_of, prior, config, start, first.coordinates[start])
+
+    def judge(step: Step) -> Step:
+        began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
+        return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
+
+    steps = best_of(config, run, judge, recent=1)
+    step = next(steps)
+    yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
+    yield from steps
+
+
+def _solved(
+    problem_of: ProblemOf, prior: Prior, config: CodeFitConfig, start: int, w: Float[Tensor, "dimensions"]
+) -> Iterator[Step]:
+    """From one start, on the same rays or points as from the others."""
+    began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
+    random = torch.Generator().manual_seed(config.seed)
+    problem: Any = None
+    state = None
+    for stage, length in stages_of(config.iterations, config.stages):
+        if problem is None or stage < 2:
+            problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
+        problem.scale, kernel = config.scale_and_kernel(stage)
+        state = problem.look(w, state)
+        solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
+        for solution in minimise(problem.residuals, state, problem.moved, solver):
+            state, damping, done = solution.state, solution.damping, done + 1
+            terms = problem.terms(state, solution.residuals)
+            seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
+            w = state.w
+            yield Step(start, done, sum(terms.values()), terms, prior.code(w), seconds, evaluations - before)
+            began = time.perf_counter()

@@ -1,0 +1,1 @@
+"""Pages of one file each, to open in a browser."""

@@ -1,0 +1,143 @@
+"""One level of the pyramid of photographs: rays drawn, pixels told apart by colour, and which view sees which point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from distrace.data.photograph import Photograph
+from distrace.decoder import Decoder
+from distrace.field import SDF, Counted
+from distrace.fitting.prior import Prior
+from distrace.fitting.targets import drawn
+from distrace.photographs.consensus import agreed
+from distrace.photographs.photo_pairs import Colours, partners, without_light
+from distrace.photographs.photo_residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
+from distrace.photographs.regions import Regions, appearance
+from distrace.pose import Similarity
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.surface import normals
+from distrace.trace import sphere_trace
+
+LEAVING = 0.03  # from a surface point towards another view, before a surface in between can hide it
+FACING = 0.2  # the least cosine between a normal and the direction to another view
+DOUBT = 0.3  # a colour whose certainty is less tells nothing
+WATCHED = 0.1  # rays of the background that come no closer than this are left out
+
+
+@dataclass(frozen=True)
+class Comparing:
+    """How photographs are compared."""
+
+    rays: int = 4000  # of all views
+    partners: int = 4  # of each view
+    weights: PhotoWeights = PhotoWeights()
+    moves: bool = True  # whether the shape's place is unknown, too
+    same_light: bool = True  # otherwise colours are compared without their local mean and contrast
+
+    def __post_init__(self) -> None:
+        if self.rays < 1 or self.partners < 1:
+            raise ValueError(f"{self.rays} rays and {self.partners} partners were asked for; both must be at least 1")
+
+
+@dataclass(frozen=True)
+class Stage:
+    """Photographs at one level of the pyramid."""
+
+    photographs: Sequence[Photograph]
+    pictures: Sequence[Colours]  # what is compared of them
+    partners: Int[Tensor, "views count"]  # to compare each view with; -1 where there are fewer
+    looks: Sequence[Float[Tensor, "height width 4"]]  # by which object and background are told apart
+    meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
+
+    @staticmethod
+    def of(photographs: Sequence[Photograph], level: float, config: Comparing) -> "Stage":
+        coarse = [photograph.resized(level) for photograph in photographs]
+        images = [each.image if config.same_light else without_light(each.image) for each in coarse]
+        pictures = [Colours.of(image, each.camera) for image, each in zip(images, coarse, strict=True)]
+        meets = [meet_sphere(each.camera.rays()).meets.reshape(-1) for each in coarse]
+        looks = [appearance(each.image) for each in coarse]
+        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners), looks, meets)
+
+    @torch.no_grad()
+    def problem(
+        self, decoder: Decoder, prior: Prior, shape: Shape, config: Comparing, random: torch.Generator
+    ) -> tuple[PhotoProblem, Look]:
+        """Rays drawn anew, what their pixels show by what is known so far, and who else sees it."""
+        view, index = self._drawn(config.rays, random)
+        rays = self._rays(view, index)
+        compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
+        in_object, sdf = shape.place.rays_in_object(rays), Counted(decoder.field(prior.code(shape.w)))
+        trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
+        sure = self._certainty(view, index, trace.hit)
+        far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
+        kept = (trace.hit | (sure > 0) | (sure < 0) & ~far).nonzero()[:, 0]
+        seen = Sightings(rays, view, compared, sure)[kept]
+        view, in_object, trace = view[kept], in_object[kept], trace[kept]
+        asked = (trace.hit & (seen.certainty >= 0)).nonzero()[:, 0]
+        visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
+        pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
+        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves)
+        problem.evaluations += sdf.evaluations
+        return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
+
+    def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+        """As many pixels of each view, of those whose rays meet the unit sphere."""
+        share = -(-count // len(self.photographs))
+        chosen = [drawn(meets.nonzero()[:, 0], share, random) for meets in self.meets]
+        return torch.cat([torch.full_like(some, number) for number, some in enumerate(chosen)]), torch.cat(chosen)
+
+    def _rays(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"]) -> Rays:
+        """Of pixels, view by view."""
+        cameras = [each.camera for each in self.photographs]
+        parts = [
+            camera.rays(camera.pixels().reshape(-1, 2)[index[view == number]]) for number, camera in enumerate(cameras)
+        ]
+        return Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
+
+    def _read(
+        self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], images: Sequence[Float[Tensor, "height width channels"]]
+    ) -> Float[Tensor, "n channels"]:
+        """What images have at pixels, view by view."""
+        parts = [image.reshape(-1, image.shape[-1])[index[view == number]] for number, image in enumerate(images)]
+        return torch.cat(parts)
+
+    def _certainty(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """By the masks where there are some, otherwise by appearance: that of hits against all others. What looks like
+        the object where most other views rule it out says nothing."""
+        asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
+        background = torch.cat([asked[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
+        is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
+        regions = Regions.of(torch.cat([asked[hit], background]), is_object)
+        images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
+        possible = agreed(self.photographs, [image > 0 for image in images])
+        kept = [image.masked_fill((image > 0) & ~shown, 0.0) for image, shown in zip(images, possible, strict=True)]
+        sure = self._read(view, index, [image[..., None] for image in kept])[:, 0]
+        sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
+        for number, each in enumerate(self.photographs):
+            if each.mask is not None:
+                some = view == number
+                sure[some] = 2.0 * each.mask.reshape(-1)[index[some]] - 1
+        return sure
+
+    def _visible(
+        self, view: Int[Tensor, "n"], place: Similarity, points_object: Float[Tensor, "n 3"], sdf: SDF
+    ) -> tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]:
+        """Points, and the partners of their views that see them: from before, in their image, with nothing between."""
+        partner = self.partners[view]
+        row, column = (partner >= 0).nonzero().T
+        other = partner[row, column]
+        points, normal = points_object[row], normals(sdf, points_object)[row]
+        eyes = torch.stack([picture.camera.T_world_camera[:3, 3] for picture in self.pictures])[other]
+        to_eye = place.rays_in_object(Rays(eyes, eyes)).origins - points
+        rays = Rays(points, to_eye / to_eye.norm(dim=-1, keepdim=True))
+        seen = (rays.directions * normal).sum(-1) > FACING
+        for number, picture in enumerate(self.pictures):
+            some = other == number
+            seen[some] &= picture.camera.shows(*picture.camera.project(place.to_world(points[some])))
+        row, other, rays = row[seen], other[seen], rays[seen]
+        leaving = Bounds(torch.full_like(rays.origins[:, 0], LEAVING), meet_sphere(rays).far)
+        clear = ~sphere_trace(sdf, rays, leaving, MARCH).hit
+        return row[clear], other[clear]

@@ -1,0 +1,1 @@
+"""The auto-decoder: a network and the codes of its shapes, learnt together."""

@@ -1,0 +1,213 @@
+"""Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import is_parametrized
+
+from distrace.checkpoint import Model
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.errors import explained
+from distrace.training.course import record
+
+VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The schedule: a short warm-up, a constant rate, and a straight line down to zero at `steps`."""
+
+    steps: int = 36_000
+    samples_per_step: int = 2048  # half of them outside; small and many steps beat large and few, minute for minute
+    shapes_per_step: int = 64
+    learning_rate: float = 1e-3
+    code_learning_rate: float = 2e-3
+    warm_up: int = 500  # steps
+    cool_down: float = (
+        0.4  # share of the steps; until it begins, a run can be given more steps as if it had them always
+    )
+    clamp: float = 0.1  # distances beyond are learnt as "far"
+    wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
+    large: float = torch.inf  # errors above count by their squares: what fills gaps is far off, and rare
+    code_penalty: float = 1e-4
+    code_bound: float = 1.0
+    code_deviation: float = 0.05  # of a code's entries at the start
+    variant_weight: float = 0.5  # how often a variant, whose name has a ~, is drawn, to once an original
+    bfloat16: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if self.steps < 1 or self.samples_per_step < 1 or not 0 <= self.seed < 2**31:
+            given = f"{self.steps} steps of {self.samples_per_step} samples with seed {self.seed}"
+            raise ValueError(f"{given} were asked for; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
+        if not (self.wrong_sign > 0 and self.large > 0):
+            given = f"a wrong sign {self.wrong_sign:g} times as much, and errors above {self.large:g} squared"
+            raise ValueError(f"{given} were asked for; both must be above 0")
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Signed samples of the shapes to learn."""
+
+    names: list[str]
+    outside: list[Float[Tensor, "_ 4"]]
+    inside: list[Float[Tensor, "_ 4"]]
+
+    def weights(self, variants: float) -> Float[Tensor, "shapes"]:
+        return torch.tensor([variants if VARIANT in name else 1.0 for name in self.names])
+
+    def to(self, device: torch.device) -> "Samples":
+        return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
+
+
+@dataclass
+class Training:
+    """What a run changes as it goes on, and what a checkpoint holds."""
+
+    decoder: Decoder
+    codes: nn.Parameter  # [shapes, length]
+    optimiser: torch.optim.Adam
+    step: int = 0
+    losses: list[float] = field(default_factory=list)  # the mean of each COURSE steps so far; the last may have fewer
+
+    def record(self, loss: float) -> None:
+        """Counts a step done."""
+        record(self.losses, self.step, loss)
+        self.step += 1
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step done: its loss, and how long it took."""
+
+    step: int
+    loss: float
+    seconds: float
+
+
+def load_samples(paths: list[Path]) -> Samples:
+    """Reads DeepSDF's `.npz` files. Raises `ValueError` for a file without `pos` and `neg` of shape [n, 4]."""
+    outside, inside = [], []
+    for path in paths:
+        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg"):
+            with np.load(path, allow_pickle=False) as archive:
+                pos, neg = (archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg"))
+        for name, part in (("pos", pos), ("neg", neg)):
+            if part.ndim != 2 or part.shape[1] != 4 or not len(part) or not np.isfinite(part).all():
+                raise ValueError(
+                    f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed"
+                )
+        outside.append(torch.from_numpy(pos))
+        inside.append(torch.from_numpy(neg))
+    return Samples([path.stem for path in paths], outside, inside)
+
+
+def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
+    """A fresh network and codes, from the configuration's seed."""
+    torch.manual_seed(config.seed)
+    decoder = Decoder(specs).to(device)
+    codes = nn.Parameter(config.code_deviation * torch.randn(shapes, specs.code_length).to(device))
+    groups = [
+        {"params": list(decoder.parameters()), "peak": config.learning_rate},
+        {"params": [codes], "peak": config.code_learning_rate},
+    ]
+    return Training(decoder, codes, torch.optim.Adam(groups, lr=0.0, fused=True))
+
+
+@torch.no_grad()
+def begin_with(training: Training, names: list[str], model: Model) -> None:
+    """Takes over a model's network, and its codes of shapes of the same names; the other shapes begin at their mean."""
+    for layer in range(training.decoder.depth):
+        own, learnt = (getattr(decoder, f"lin{layer}") for decoder in (training.decoder, model.decoder))
+        if is_parametrized(own, "weight"):
+            own.weight = learnt.weight.detach()  # weight norm takes it apart
+        else:
+            own.weight.copy_(learnt.weight)
+        own.bias.copy_(learnt.bias)
+    known = dict(zip(model.shapes, model.codes, strict=True))
+    training.codes.copy_(torch.stack([known.get(name, model.codes.mean(0)) for name in names]))
+
+
+def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator[Step]:
+    """Trains in place and yields after every step, from wherever `training` is to the last one.
+
+    The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
+    """
+    device = training.codes.device
+    training.decoder.train()
+    while training.step < config.steps:
+        began = time.perf_counter()
+        for group in training.optimiser.param_groups:
+            group["lr"] = group["peak"] * _rate(training.step, config)
+        torch.manual_seed((config.seed << 32) + training.step)
+        shapes, batch = draw(samples, config)
+        codes = training.codes[shapes]
+        with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
+            values = training.decoder(batch[..., :3], codes[:, None])
+        loss = training_loss(values.float(), batch[..., 3], config)
+        training.optimiser.zero_grad()
+        (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
+        training.optimiser.step()
+        bound_codes(training.codes, config.code_bound)
+        training.record(value := loss.item())
+        yield Step(training.step, value, time.perf_counter() - began)
+
+
+def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:
+    """A step's shapes, and as many samples inside as outside of each."""
+    count = min(config.shapes_per_step, len(samples.names))
+    shapes = torch.multinomial(samples.weights(config.variant_weight), count)
+    per_side = max(config.samples_per_step // count // 2, 1)
+    sides = [(samples.outside[shape], samples.inside[shape]) for shape in shapes]
+    batch = [torch.cat([side[torch.randint(len(side), (per_side,))] for side in pair]) for pair in sides]
+    return shapes, torch.stack(batch)
+
+
+def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:
+    """The clamped loss where samples that matter for the shape, but are few, count more.
+
+    Those with a wrong sign are what thin parts are lost by (cf. Duan et al., *Curriculum DeepSDF*, ECCV 2020, section
+    3.2); large errors, of a reverse Huber loss (Laina et al., 3DV 2016, section 3.2), what gaps are filled by.
+    """
+    off, limit = clamped_error(values, distances, config.clamp), config.large
+    if limit < torch.inf:
+        off = torch.where(off > limit, (off.square() + limit**2) / (2 * limit), off)
+    return (torch.where(values * distances < 0, config.wrong_sign, 1.0) * off).mean()
+
+
+def clamped_loss(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
+    """Mean |clamp(f) − clamp(d)| (Park et al. 2019, eq. 4)."""
+    return clamped_error(values, distances, clamp).mean()
+
+
+def clamped_error(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
+    return (values.clamp(-clamp, clamp) - distances.clamp(-clamp, clamp)).abs()
+
+
+@torch.no_grad()
+def bound_codes(codes: Tensor, bound: float) -> None:
+    """Scales codes that are longer than the bound back to it."""
+    codes.mul_((bound / codes.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0))
+
+
+def _rate(step: int, config: TrainConfig) -> float:
+    """Of the highest one. A trapezium does what a cosine does, and can be prolonged (Hägele et al., NeurIPS 2024)."""
+    left = (config.steps - step) / (config.steps * config.cool_down)
+    return min(1.0, (step + 1) / config.warm_up, left)
+
+
+def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:
+    """Whether this machine trains faster with bfloat16 products: some processors emulate them."""
+    seconds = {}
+    for bfloat16 in (False, True, False, True):  # the second time of each counts
+        config = TrainConfig(steps=2, bfloat16=bfloat16)
+        random = [torch.rand(4096, 4) * 0.1]
+        run = train(Samples(["random"], random, random).to(device), start(1, specs, config, device), config)
+        seconds[bfloat16] = min(step.seconds for step in run)
+    return seconds[True] < seconds[False]
