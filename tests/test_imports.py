@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("errors", "files", "processes", "rays", "camera", "pose"),
+    *("threads", "errors", "files", "processes", "rays", "camera", "pose"),
     *("field", "primitives", "decoder", "checkpoint"),
     *("trace", "pyramid", "fast", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),

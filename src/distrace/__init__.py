@@ -1,5 +1,7 @@
 """A differentiable renderer for neural signed distance functions, by sphere tracing."""
 
+from distrace import threads as threads  # isort: skip
+
 from distrace.boundary import shade as shade
 from distrace.camera import Camera as Camera
 from distrace.checking.gradcheck import GradientCheck as GradientCheck
