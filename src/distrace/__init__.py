@@ -9,6 +9,7 @@ from distrace.checking.gradcheck import check_gradients as check_gradients
 from distrace.checking.moves import decoder_changes as decoder_changes
 from distrace.checkpoint import Model as Model
 from distrace.checkpoint import load_model as load_model
+from distrace.checkpoint import save_model as save_model
 from distrace.data.view import View as View
 from distrace.data.view import load_view as load_view
 from distrace.fast.lattice import Lattice as Lattice

@@ -81,7 +81,7 @@ def load_model(name: str | Path) -> Model:
 
 
 def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
-    """Writes our own, smaller form: weight norm multiplied out, in half precision."""
+    """Writes our own, smaller form into a folder: weight norm multiplied out, in half precision."""
     specs = model.decoder.specs
     plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
     tensors = {key: value for key, value in model.decoder.state_dict().items() if "parametrizations" not in key}
