@@ -16,10 +16,10 @@ from distrace.decoder import Decoder
 from distrace.fitting.prior import Prior
 from distrace.photographs.doubtful import agreements
 from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
-from distrace.photographs.photo_pairs import Colours, partners, without_light
-from distrace.photographs.photo_residuals import PhotoProblem, Shape
-from distrace.photographs.photo_stage import Comparing, Stage
+from distrace.photographs.pairs import Colours, partners, without_light
 from distrace.photographs.regions import Regions, appearance
+from distrace.photographs.residuals import PhotoProblem, Shape
+from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render

@@ -32,9 +32,8 @@ from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import between, drift, motions, moved, relative
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
-from distrace.reconstruction.reconstruction_run import load_reconstruction, mark, save_reconstruction
-from distrace.reconstruction.reconstruction_terms import MARCH, Pool, coloured, terms_of
 from distrace.reconstruction.registration import registered
+from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import (
     ColourNetwork,
     CountedSurface,
@@ -42,6 +41,7 @@ from distrace.reconstruction.surface_network import (
     SurfaceSpecs,
     squareplus,
 )
+from distrace.reconstruction.terms import MARCH, Pool, coloured, terms_of
 from distrace.render import render
 from distrace.surface import attach
 from distrace.trace import sphere_trace

@@ -9,7 +9,7 @@ from test_fit_photos import COMPARED, GREY, TRUE, photographs, ring
 
 from distrace.data.photograph import Photograph
 from distrace.field import SDF, placed
-from distrace.photographs.photo_stage import Stage
+from distrace.photographs.stage import Stage
 from distrace.photographs.whereabouts import whereabouts
 from distrace.pose import Similarity
 

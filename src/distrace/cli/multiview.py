@@ -20,8 +20,8 @@ from distrace.movie import save_gif
 from distrace.pages.views_page import forming, views_page
 from distrace.photographs.doubtful import Agreement, agreements
 from distrace.photographs.fit_photos import PhotoConfig, PhotoStep, fit_photos
-from distrace.photographs.photo_residuals import Shape
-from distrace.photographs.photo_stage import Comparing
+from distrace.photographs.residuals import Shape
+from distrace.photographs.stage import Comparing
 
 
 @dataclass(frozen=True)

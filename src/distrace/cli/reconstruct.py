@@ -19,7 +19,7 @@ from distrace.mesh import MeshConfig
 from distrace.pages.reconstruction_page import judged
 from distrace.photographs.hull import Overlap, overlaps
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
-from distrace.reconstruction.reconstruction_run import load_reconstruction, mark, save_reconstruction
+from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.shading import save_png
 

@@ -33,7 +33,7 @@ from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
-from distrace.photographs.photo_stage import Comparing, Stage
+from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
 
 METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")

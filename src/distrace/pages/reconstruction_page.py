@@ -20,7 +20,7 @@ from distrace.pages.charts import curves
 from distrace.pages.page import Html, figure, page, paragraph, section, table
 from distrace.pages.scene import scene
 from distrace.reconstruction.reconstruct import Reconstruction
-from distrace.reconstruction.reconstruction_terms import coloured
+from distrace.reconstruction.terms import coloured
 from distrace.render import Buffers, render
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 from distrace.training.course import COURSE

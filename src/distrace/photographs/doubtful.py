@@ -12,8 +12,8 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.fitting.prior import Prior
-from distrace.photographs.photo_residuals import Look, PhotoProblem, Shape
-from distrace.photographs.photo_stage import Comparing, Stage
+from distrace.photographs.residuals import Look, PhotoProblem, Shape
+from distrace.photographs.stage import Comparing, Stage
 
 LEVEL = 0.5  # of the images' size
 FAR_OFF = 2.5  # × the median over views: farther off than that, a view is doubtful …

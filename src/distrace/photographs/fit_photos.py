@@ -18,8 +18,8 @@ from distrace.field import Counted
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, stages_of
-from distrace.photographs.photo_residuals import Shape
-from distrace.photographs.photo_stage import Comparing, Stage
+from distrace.photographs.residuals import Shape
+from distrace.photographs.stage import Comparing, Stage
 from distrace.photographs.whereabouts import whereabouts
 from distrace.pose import Similarity
 

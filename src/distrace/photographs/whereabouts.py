@@ -10,8 +10,8 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.field import SDF
 from distrace.photographs.hull import allowed
-from distrace.photographs.photo_stage import Stage
 from distrace.photographs.regions import Regions
+from distrace.photographs.stage import Stage
 from distrace.pose import Similarity
 from distrace.render import render
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.field import SDF
-from distrace.photographs.photo_pairs import partners
+from distrace.photographs.pairs import partners
 
 ACROSS = 5  # pixels of a patch
 PARTNERS, BEST = 4, 2  # views that each is compared with, and of these those that count: the others may be hidden

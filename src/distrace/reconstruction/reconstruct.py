@@ -17,9 +17,9 @@ from distrace.field import value_and_gradient
 from distrace.photographs.hull import visual_hull
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import motions, relative
-from distrace.reconstruction.reconstruction_terms import SHELL, Pool, terms_of, unit_length
 from distrace.reconstruction.retouch import Canvas
 from distrace.reconstruction.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
+from distrace.reconstruction.terms import SHELL, Pool, terms_of, unit_length
 from distrace.training.course import record
 
 SURVEYED = 400_000  # points, of which those near the hull's surface are kept

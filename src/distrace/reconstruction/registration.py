@@ -12,7 +12,7 @@ from distrace.data.photograph import Photograph
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import motions, moved
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
-from distrace.reconstruction.reconstruction_terms import Pool, terms_of
+from distrace.reconstruction.terms import Pool, terms_of
 
 STEPS, RAYS, RATE = 100, 1024, 1e-3
 SHARPNESS = 400.0  # of the outline, per radius

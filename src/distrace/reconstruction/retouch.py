@@ -11,8 +11,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.rays import meet_sphere
-from distrace.reconstruction.reconstruction_terms import Pixels, described
 from distrace.reconstruction.surface_network import ColourNetwork, Surface
+from distrace.reconstruction.terms import Pixels, described
 from distrace.trace import TraceConfig, sphere_trace
 
 MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=3e-4, steps=50, least_step=2e-3)

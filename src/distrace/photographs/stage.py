@@ -13,9 +13,9 @@ from distrace.field import SDF, Counted
 from distrace.fitting.prior import Prior
 from distrace.fitting.targets import drawn
 from distrace.photographs.consensus import agreed
-from distrace.photographs.photo_pairs import Colours, partners, without_light
-from distrace.photographs.photo_residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
+from distrace.photographs.pairs import Colours, partners, without_light
 from distrace.photographs.regions import Regions, appearance
+from distrace.photographs.residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
 from distrace.pose import Similarity
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import normals

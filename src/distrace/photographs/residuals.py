@@ -18,7 +18,7 @@ from distrace.field import Counted
 from distrace.fitting.code_residuals import SMALL, derivatives
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals, charbonnier
-from distrace.photographs.photo_pairs import Colours
+from distrace.photographs.pairs import Colours
 from distrace.pose import Similarity
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
