@@ -151,7 +151,7 @@ def test_a_trial_leaves_its_surface_and_is_done_again_without_it(
         return np.asarray(ball.vertices) * 1.05
 
     for module in ("multiview_table", "clip_page"):
-        monkeypatch.setattr(f"distrace.{module}.true_solid", lambda *given: Solid(ball, ball))
+        monkeypatch.setattr(f"distrace.evaluation.{module}.true_solid", lambda *given: Solid(ball, ball))
     monkeypatch.setattr("distrace.evaluation.multiview_table.stereo_points", found)
     trial = ClipTrial(tmp_path / "clip", "stereo", tmp_path, tmp_path / "out", str(model))
     result = clip_done(trial)
