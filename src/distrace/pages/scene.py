@@ -31,7 +31,7 @@ def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
     ]
     hidden = dict(visible=False)
-    everything = np.concatenate([*(mesh.vertices for mesh in meshes.values()), *clouds.values()])
+    everything = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes.values()), *clouds.values()])
     camera = dict(eye=dict(zip("xyz", _eye(everything))))
     layout = go.Layout(
         template="none",
@@ -47,7 +47,7 @@ def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray
 
 def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     """From where the box of all points fits into the picture; plotly's unit is the geometric mean of its sides."""
-    sides = np.ptp(points[:, [2, 0, 1]], axis=0) if len(points) else np.ones(3)
+    sides = np.ptp(_turned(points), axis=0) if len(points) else np.ones(3)
     sides = np.maximum(sides, 0.01 * max(sides.max(), 1e-9))
     corners = sides / np.prod(sides) ** (1 / 3) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5)
     back = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
@@ -89,8 +89,12 @@ def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
 
 
 def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+    return dict(zip("xyz", _turned(points).astype(np.float32).T))
+
+
+def _turned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """World z, x, y as plotly's x, y, z: its turntable turns around its z alone."""
-    return dict(zip("xyz", points[:, [2, 0, 1]].astype(np.float32).T))
+    return points[:, [2, 0, 1]]
 
 
 def _decimated(

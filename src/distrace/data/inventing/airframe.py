@@ -50,18 +50,18 @@ def tail(random: np.random.Generator, wide: float, sweep: float, on_top: bool) -
     """A fin and a pair of stabilisers, on top of it or beside the fuselage's end."""
     high, chord, span = random.uniform(0.12, 0.2), random.uniform(0.12, 0.2), random.uniform(0.14, 0.22)
     base, z = 0.5 * wide, chord - 0.5 + random.uniform(0, 0.03)
-    parts = fin((0, base, z), high, chord, sweep, 0)
+    upright = fin((0, base, z), high, chord, sweep, 0)
     top = (base + high, z - high * np.tan(np.radians(sweep)) - 0.02)
     place, dihedral = (top, 0) if on_top else ((base, z - 0.03), 5)
-    return parts + wing(random, place, span, 0.7 * chord, random.uniform(0.35, 0.8), 0.9 * sweep, dihedral, 0.1)
+    return [upright, *wing(random, place, span, 0.7 * chord, random.uniform(0.35, 0.8), 0.9 * sweep, dihedral, 0.1)]
 
 
-def fin(place: Vector, high: float, chord: float, sweep: float, lean: float) -> list[Part]:
+def fin(place: Vector, high: float, chord: float, sweep: float, lean: float) -> Part:
     """An upright one from its foot's front edge; `lean` × its height its top is further out."""
     x, y, z = place
     across, back = np.array([1.0, -lean, 0.0]), np.tan(np.radians(sweep))
     top = aerofoil((x + lean * high, y + high, z - high * back), 0.5 * chord, 0.09, across)
-    return [np.concatenate([aerofoil((x, y - 0.02, z), chord, 0.1, across), top])]
+    return np.concatenate([aerofoil((x, y - 0.02, z), chord, 0.1, across), top])
 
 
 def gear(random: np.random.Generator, wide: float, at: float, often: float) -> list[Part]:

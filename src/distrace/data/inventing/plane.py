@@ -105,7 +105,8 @@ def fighter(random: np.random.Generator) -> list[Part]:
     pairs = random.random() < 0.4
     lean = random.uniform(0, 0.4) if pairs else 0.0
     for s in SIDES if pairs else (0,):
-        parts += fin((s * wide, 0.5 * wide, -0.3), random.uniform(0.14, 0.2), 0.17, random.uniform(35, 50), lean * s)
+        high, sweep_of_fin = random.uniform(0.14, 0.2), random.uniform(35, 50)
+        parts.append(fin((s * wide, 0.5 * wide, -0.3), high, 0.17, sweep_of_fin, lean * s))
     if not delta:
         parts += wing(random, (0, -0.35), random.uniform(0.16, 0.24), 0.13, 0.3, random.uniform(30, 45), 0, thick=0.05)
     elif random.random() < 0.4:
