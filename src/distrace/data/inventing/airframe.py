@@ -10,7 +10,10 @@ from .parts import Part, Vector, rod
 Section = Float[np.ndarray, "around 3"]
 """Points around a part, of which the part to the next section is the convex hull."""
 
-SIDES = (-1, 1)
+
+def both_sides(parts: list[Part]) -> list[Part]:
+    """Parts of one side, and their like on the other."""
+    return [part * (side, 1, 1) for side in (1, -1) for part in parts]
 
 
 def fuselage(random: np.random.Generator, wide: float, nose: float, rear: float, thick_end: float = 0.0) -> list[Part]:
@@ -39,11 +42,11 @@ def wing(
     kink, middle = random.uniform(0.25, 0.45), random.choice([0.0, random.uniform(0.0, 0.25)])
     chords = [(0.0, 1.0), (kink, 1 - (1 - taper) * kink - middle * (1 - taper) * (1 - kink)), (1.0, taper)]
 
-    def section(side: int, out: float, share: float) -> Section:
-        front = (side * half * out, y + half * out * up, z - half * out * back)
+    def section(out: float, share: float) -> Section:
+        front = (half * out, y + half * out * up, z - half * out * back)
         return aerofoil(front, chord * share, thick * (1 - 0.3 * out))
 
-    return [part for side in SIDES for part in lofted([section(side, *rest) for rest in chords])]
+    return both_sides(lofted([section(*rest) for rest in chords]))
 
 
 def tail(random: np.random.Generator, wide: float, sweep: float, on_top: bool) -> list[Part]:

@@ -10,7 +10,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-Part = Float[np.ndarray, "points 3"]
+Part = Float[np.ndarray, "_ 3"]
 """Points whose convex hull is the part."""
 
 Point = tuple[float, float, float]

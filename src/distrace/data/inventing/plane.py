@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .airframe import SIDES, canopy, fin, fuselage, gear, jet, spinner, tail, wing
+from .airframe import both_sides, canopy, fin, fuselage, gear, jet, spinner, tail, wing
 from .parts import Part, block, rod
 
 
@@ -32,7 +32,7 @@ def airliner(random: np.random.Generator) -> list[Part]:
 def jets_at_rear(random: np.random.Generator, wide: float, size: float) -> list[Part]:
     """A pair beside the fuselage's end, and now and then a third one at the foot of the fin."""
     out, y = wide + 0.9 * size, 0.4 * wide
-    parts = [jet((s * out, y, -0.26), size, random.uniform(0.1, 0.14)) for s in SIDES]
+    parts = both_sides([jet((out, y, -0.26), size, random.uniform(0.1, 0.14))])
     parts.append(block((-out, y - 0.004, -0.29), (out, y + 0.004, -0.24), 0.003))
     if random.random() < 0.3:
         parts.append(jet((0, 1.3 * wide, -0.38), 0.5 * wide, 0.24))
@@ -47,9 +47,9 @@ def jets_beneath(
     parts = []
     for x in half * (random.choice([0.33, 0.3]) + 0.3 * np.arange(random.choice([1, 2], p=[0.8, 0.2]))):
         z, under = at - x * back + random.uniform(0.02, 0.06), y + x * up - 1.15 * size
-        parts += [jet((s * x, under, z), size, random.uniform(0.08, 0.14)) for s in SIDES]
-        parts += [block((s * x - 0.004, under, z - 0.1), (s * x + 0.004, under + 1.3 * size, z), 0.003) for s in SIDES]
-    return parts
+        parts.append(jet((x, under, z), size, random.uniform(0.08, 0.14)))
+        parts.append(block((x - 0.004, under, z - 0.1), (x + 0.004, under + 1.3 * size, z), 0.003))
+    return both_sides(parts)
 
 
 def propeller(random: np.random.Generator) -> list[Part]:
@@ -64,9 +64,9 @@ def propeller(random: np.random.Generator) -> list[Part]:
     if engines == 1 and random.random() < 0.15:
         above, out = y + random.uniform(0.12, 0.2), 0.3 * span
         parts += wing(random, (above, at + 0.03), span / 2, chord, taper, sweep, dihedral)
-        parts += [rod((s * out, y, at - 0.05), (s * out, above, at - 0.02), 0.004, 0.004, 6) for s in SIDES]
+        parts += both_sides([rod((out, y, at - 0.05), (out, above, at - 0.02), 0.004, 0.004, 6)])
     elif engines == 1 and high and random.random() < 0.6:
-        parts += [rod((s * wide, -0.5 * wide, at - 0.06), (s * 0.25, y, at - 0.06), 0.004, 0.005, 6) for s in SIDES]
+        parts += both_sides([rod((wide, -0.5 * wide, at - 0.06), (0.25, y, at - 0.06), 0.004, 0.005, 6)])
     parts += tail(random, wide, random.uniform(0, 30), on_top=engines > 1 and random.random() < 0.5)
     if engines == 1:
         parts += [canopy(random, wide, at - random.uniform(0.0, 0.08))] if random.random() < 0.7 else []
@@ -82,11 +82,10 @@ def on_wings(
     parts = []
     for x in np.arange(1, pairs + 1) * random.uniform(0.11, 0.15) + 0.02:
         size, high = random.uniform(0.018, 0.03), y + x * up
-        for s in SIDES:
-            parts.append(rod((s * x, high, at - chord), (s * x, high, at), 0.3 * size, size))
-            parts.append(rod((s * x, high, at), (s * x, high, at + 0.07), size, 0.7 * size))
-            parts += spinner((s * x, high, at + 0.07), 0.4 * size, 0.09, random)
-    return parts
+        parts.append(rod((x, high, at - chord), (x, high, at), 0.3 * size, size))
+        parts.append(rod((x, high, at), (x, high, at + 0.07), size, 0.7 * size))
+        parts += spinner((x, high, at + 0.07), 0.4 * size, 0.09, random)
+    return both_sides(parts)
 
 
 def fighter(random: np.random.Generator) -> list[Part]:
@@ -99,14 +98,13 @@ def fighter(random: np.random.Generator) -> list[Part]:
     parts += wing(random, (y, at), span / 2, chord, taper, sweep, random.uniform(-4, 2), thick=0.05)
     parts += [canopy(random, wide, random.uniform(0.2, 0.28))]
     intake, end = random.uniform(0.6, 1.0) * wide, random.uniform(0.1, 0.2)
-    parts += [
-        block((s * wide - 0.4 * wide, -intake, -0.35), (s * wide + 0.4 * wide, 0.3 * intake, end), 0.012) for s in SIDES
-    ]
-    pairs = random.random() < 0.4
-    lean = random.uniform(0, 0.4) if pairs else 0.0
-    for s in SIDES if pairs else (0,):
-        high, sweep_of_fin = random.uniform(0.14, 0.2), random.uniform(35, 50)
-        parts.append(fin((s * wide, 0.5 * wide, -0.3), high, 0.17, sweep_of_fin, lean * s))
+    parts += both_sides([block((0.6 * wide, -intake, -0.35), (1.4 * wide, 0.3 * intake, end), 0.012)])
+    high, sweep_of_fin = random.uniform(0.14, 0.2), random.uniform(35, 50)
+    if random.random() < 0.4:
+        lean = random.uniform(0, 0.4)
+        parts += both_sides([fin((wide, 0.5 * wide, -0.3), high, 0.17, sweep_of_fin, lean)])
+    else:
+        parts.append(fin((0, 0.5 * wide, -0.3), high, 0.17, sweep_of_fin, 0))
     if not delta:
         parts += wing(random, (0, -0.35), random.uniform(0.16, 0.24), 0.13, 0.3, random.uniform(30, 45), 0, thick=0.05)
     elif random.random() < 0.4:
