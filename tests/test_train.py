@@ -22,6 +22,7 @@ from distrace.checkpoint import load_model, save_experiment, save_model
 from distrace.cli import main
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
+from distrace.files import alone
 from distrace.training.resume import NAME, load_training, save_training
 from distrace.training.train import (
     Samples,
@@ -326,7 +327,7 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Pa
     assert torch.equal(one["codes"], other["codes"])
     assert one["losses"] == other["losses"]
     assert_same_state(one["decoder"], other["decoder"])
-    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "ModelParameters", "LatentCodes"}
+    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "ModelParameters", "LatentCodes", ".lock"}
     assert {path.name for path in whole.iterdir()} == wanted
     assert load_model(whole).shapes == ("sphere0", "sphere1")
 
@@ -340,6 +341,15 @@ def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytes
     assert "going on from step 3 of 3" in capsys.readouterr().out
     assert_same_state(before["decoder"], checkpoint(out)["decoder"])
     assert json.loads((out / "result.json").read_text())["loss"] == before["losses"][-1]
+
+
+def test_a_folder_that_another_run_is_writing_is_left_to_it(tmp_path: Path, run, capsys) -> None:
+    samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
+    out.mkdir()
+    with alone(out), pytest.raises(SystemExit):
+        run("train", samples, "--out", out, *TINY)
+    assert f"another run is writing {out}; wait for its end, or give another --out" in capsys.readouterr().err
+    assert [path.name for path in out.iterdir()] == [".lock"]
 
 
 def test_what_a_run_has_otherwise_is_not_taken_from_another_command(tmp_path: Path, run, capsys) -> None:

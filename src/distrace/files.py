@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+from filelock import FileLock, Timeout
 from torch import Tensor
 
 
@@ -24,6 +25,17 @@ def written(path: Path) -> Iterator[BinaryIO]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
+
+
+@contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Keeps a folder to one process, for as long as it runs. Raises `ValueError` where another has it."""
+    try:
+        held = FileLock(folder / ".lock").acquire(blocking=False)
+    except Timeout:
+        raise ValueError(f"another run is writing {folder}; wait for its end, or give another --out") from None
+    with held:
+        yield
 
 
 def save_text(path: Path, text: str) -> None:

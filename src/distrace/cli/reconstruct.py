@@ -14,7 +14,7 @@ from distrace.cli.reconstructed import Reconstructed
 from distrace.data.dark import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
-from distrace.files import save_json
+from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
 from distrace.pages.reconstruction_page import judged
 from distrace.photographs.hull import Overlap, overlaps
@@ -61,8 +61,9 @@ class Reconstruct:
             if each.doubtful:
                 console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
-        state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
-        Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(run, resolved)
+        with alone(run.out):
+            state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
+            Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(run, resolved)
 
     @property
     def config(self) -> ReconstructConfig:

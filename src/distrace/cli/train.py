@@ -18,6 +18,7 @@ from distrace.data import sampling
 from distrace.data.split import every_mesh, has_meshes, on_side
 from distrace.decoder import NetworkSpecs
 from distrace.evaluation.bench import poster_view
+from distrace.files import alone
 from distrace.pages.charts import save_course
 from distrace.pages.report import View
 from distrace.render import render
@@ -59,6 +60,11 @@ class Train:
             raise ValueError(f"--minutes {self.minutes} was given; a finite time is needed, longer than none")
         torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers: training was 2.3 times slower
         run = start(self.out, self.device)
+        with alone(run.out):
+            self._learn(run)
+
+    def _learn(self, run: Run) -> None:
+        """All of it, from samples to the run's result."""
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
         loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
         resumed = load_training(self.out, loaded.names, run.device)
