@@ -115,7 +115,7 @@ def fitted(
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
-        console.print("carving what the masks allow, and teaching the network that")
+        console.print("carving what masks and matches allow, and teaching the network that")
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
         begin_with_hull(state, views, config)

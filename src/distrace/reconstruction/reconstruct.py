@@ -14,7 +14,7 @@ from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.field import value_and_gradient
-from distrace.photographs.hull import visual_hull
+from distrace.photographs.hull import carved_hull, visual_hull
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import motions, relative
 from distrace.reconstruction.retouch import Canvas
@@ -126,12 +126,13 @@ class Step:
 
 
 def begin_with_hull(state: Reconstruction, photographs: Sequence[Photograph], config: ReconstructConfig) -> None:
-    """Teaches the surface what the masks allow: from there colours need not find what outlines know.
+    """Teaches the surface what the masks allow: from there colours need not find what outlines know. Where colours
+    shape it, what views see through is left out, too: a court that is filled can be painted, and so would stay filled.
 
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
     began = time.perf_counter()
-    hull, device = visual_hull(photographs), state.surface.last.weight.device
+    hull, device = (carved_hull if config.colours_shape else visual_hull)(photographs), state.surface.last.weight.device
     surface = CountedSurface(state.surface)
     random = torch.Generator().manual_seed(config.seed)
     points = 2 * torch.rand(SURVEYED, 3, generator=random) - 1
