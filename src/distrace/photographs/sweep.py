@@ -18,6 +18,7 @@ from distrace.photographs.pairs import partners
 
 SIZE = 160  # pixels along the longer side, of views that are compared
 PLANES = 96  # about one for each pixel by which neighbours show them apart
+NEAREST = 0.1  # radii: of the planes, where an eye is within the sphere, or looks away
 PARTNERS, BEST = 4, 2  # views that each is compared with, and of these those that count: the others may be hidden
 WINDOW = 7  # pixels
 EVEN = 4e-4  # variance of brightness below which a window says nothing
@@ -36,7 +37,7 @@ class Depths:
     depth: Float[Tensor, "height width"]
     sure: Bool[Tensor, "height width"]
 
-    def of(self, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
+    def votes(self, points: Float[Tensor, "n 3"]) -> tuple[Bool[Tensor, "n"], Bool[Tensor, "n"]]:
         """Which points the view sees through, and which lie where it sees something."""
         pixels, depths = self.camera.project(points)
         through, there = torch.zeros(2, len(points), dtype=torch.bool)
@@ -53,7 +54,7 @@ def seen_through(photographs: Sequence[Photograph], points: Float[Tensor, "n 3"]
     """Which points several views look through, by depths that neighbours agree on. Needs masks."""
     through, there = torch.zeros(2, len(points))
     for depths in swept(photographs):
-        free, filled = depths.of(points)
+        free, filled = depths.votes(points)
         through += free
         there += filled
     return (through >= AGREED) & (through > OUTVOTED * there)
@@ -72,7 +73,7 @@ def _depths(view: Photograph, others: Sequence[Photograph]) -> Depths:
     """The planes, parallel to the image, on which it is most like its partners."""
     camera = view.camera
     centre = camera.project(torch.zeros(1, 3))[1].item()
-    planes = 1 / torch.linspace(1 / max(centre - 1, 0.1), 1 / (centre + 1), PLANES)
+    planes = 1 / torch.linspace(1 / max(centre - 1, NEAREST), 1 / max(centre + 1, 2 * NEAREST), PLANES)
     here, partner_images, rays = _Image.of(view), [_Image.of(each) for each in others], camera.rays()
     alike = torch.stack([_alike(here, partner_images, rays.at(depth / camera.cosines())) for depth in planes])
     best, plane = alike.max(0)
