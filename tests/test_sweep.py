@@ -12,6 +12,8 @@ from distrace.field import SDF
 from distrace.photographs.hull import carved_hull, visual_hull
 from distrace.photographs.sweep import OFF, seen_through, swept
 from distrace.primitives import difference, sphere
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull
+from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.render import render
 
 BOWL = difference(sphere(0.8), sphere(0.55, torch.tensor([0.0, 0.0, 0.6])))  # hollow to z = 0.05
@@ -61,6 +63,19 @@ def test_a_hollow_is_carved_that_no_outline_shows(bowl: list[Photograph]) -> Non
     assert (hull(places[hollow]) < 0).float().mean() > 0.9
     assert (carved(places[hollow]) > 0).float().mean() > 0.9
     assert (carved(places[true < -0.05]) < 0).float().mean() > 0.99, "what is there stays"
+
+
+def test_a_network_begins_with_a_hollow_where_that_is_asked_for(bowl: list[Photograph]) -> None:
+    specs, hollow = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4), torch.tensor([[0.0, 0.0, 0.5]])
+    found = []
+    for carved in (False, True):
+        config = ReconstructConfig(hull_steps=300, rays=256, learning_rate=5e-3, carved=carved)
+        state = Reconstruction.fresh(specs, config, len(bowl), torch.device("cpu"))
+        begin_with_hull(state, bowl, config)
+        found.append(state.surface(hollow).item())
+    filled, open_ = found
+    assert filled < -0.05
+    assert open_ > 0.05
 
 
 def test_nothing_is_seen_through_where_nothing_tells_depths(bowl: list[Photograph]) -> None:

@@ -42,6 +42,7 @@ class Reconstruct:
     rays: int = ReconstructConfig.rays  # of each step
     width: int = SurfaceSpecs.width  # of the surface's network
     silhouettes_only: Flag = False  # colours do not shape the surface: a visual hull, painted
+    carved: Flag = False  # begin without what views see through: courts and hollows, which no outline shows
     held_out: int = 8  # one view in so many is not fitted to, but compared; 0 for none
     leave_out: tuple[str, ...] = ()  # names of views that are not used at all
     resolution: int = 256  # of the mesh
@@ -67,7 +68,7 @@ class Reconstruct:
 
     @property
     def config(self) -> ReconstructConfig:
-        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "seed")}
+        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "carved", "seed")}
         return ReconstructConfig(**own, colours_shape=not self.silhouettes_only)
 
     @property
@@ -115,7 +116,7 @@ def fitted(
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
-        console.print("carving what masks and matches allow, and teaching the network that")
+        console.print("carving what the masks allow, and teaching the network that")
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
         begin_with_hull(state, views, config)

@@ -49,6 +49,7 @@ class ReconstructConfig:
     retouching: int = 1000  # steps after all others, of the colours alone …
     retouched: int = 4096  # … and the pixels of each
     colours_shape: bool = True  # without, only outlines shape the surface: a visual hull
+    carved: bool = False  # begin without what views see through, by depths that their neighbours agree on
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -126,13 +127,13 @@ class Step:
 
 
 def begin_with_hull(state: Reconstruction, photographs: Sequence[Photograph], config: ReconstructConfig) -> None:
-    """Teaches the surface what the masks allow: from there colours need not find what outlines know. Where colours
-    shape it, what views see through is left out, too: a court that is filled can be painted, and so would stay filled.
+    """Teaches the surface what the masks allow: from there colours need not find what outlines know. If it is `carved`,
+    what views see through is left out, too: a court that is filled can be painted, and so stays filled.
 
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
     began = time.perf_counter()
-    hull, device = (carved_hull if config.colours_shape else visual_hull)(photographs), state.surface.last.weight.device
+    hull, device = (carved_hull if config.carved else visual_hull)(photographs), state.surface.last.weight.device
     surface = CountedSurface(state.surface)
     random = torch.Generator().manual_seed(config.seed)
     points = 2 * torch.rand(SURVEYED, 3, generator=random) - 1
