@@ -52,14 +52,19 @@ def without_light(image: Float[Tensor, "height width channels"]) -> Float[Tensor
 
     Differences of it are those of normalised cross-correlation.
     """
-    values = image.permute(2, 0, 1)[None]
+    values = image.permute(2, 0, 1)
+    mean, variance = about(values, WINDOW)
+    return (0.2 * (values - mean) / (variance.sqrt() + CONTRAST)).permute(1, 2, 0)
 
-    def mean(of: Tensor) -> Tensor:
-        return avg_pool2d(of, WINDOW, 1, WINDOW // 2, count_include_pad=False)
 
-    middle = mean(values)
-    deviation = (mean(values.square()) - middle.square()).clamp_min(0).sqrt()
-    return (0.2 * (values - middle) / (deviation + CONTRAST))[0].permute(1, 2, 0)
+def about(images: Float[Tensor, "n height width"], window: int) -> tuple[Tensor, Tensor]:
+    """Mean and variance over the window about each pixel, as far as it lies within the image."""
+    mean = windowed(images, window)
+    return mean, (windowed(images.square(), window) - mean.square()).clamp_min(0)
+
+
+def windowed(images: Float[Tensor, "n height width"], window: int) -> Float[Tensor, "n height width"]:
+    return avg_pool2d(images[None], window, 1, window // 2, count_include_pad=False)[0]
 
 
 def partners(cameras: Sequence[Camera], count: int) -> Int[Tensor, "views count"]:

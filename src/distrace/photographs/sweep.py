@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, grid_sample
+from torch.nn.functional import grid_sample
 
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
-from distrace.photographs.pairs import partners
+from distrace.photographs.pairs import about, partners, windowed
 
 SIZE = 160  # pixels along the longer side, of views that are compared
 PLANES = 96  # about one for each pixel by which neighbours show them apart
@@ -74,8 +74,8 @@ def _depths(view: Photograph, others: Sequence[Photograph]) -> Depths:
     camera = view.camera
     centre = camera.project(torch.zeros(1, 3))[1].item()
     planes = 1 / torch.linspace(1 / max(centre - 1, NEAREST), 1 / max(centre + 1, 2 * NEAREST), PLANES)
-    here, partner_images, rays = _Image.of(view), [_Image.of(each) for each in others], camera.rays()
-    alike = torch.stack([_alike(here, partner_images, rays.at(depth / camera.cosines())) for depth in planes])
+    here, rays, stretch = _Image.of(view.image.mean(-1)), camera.rays(), 1 / camera.cosines()
+    alike = torch.stack([_alike(here, others, rays.at(depth * stretch)) for depth in planes])
     best, plane = alike.max(0)
     beside = (torch.arange(PLANES)[:, None, None] - plane).abs() <= BESIDE
     alone = best - alike.masked_fill(beside, -1).amax(0) > ALONE
@@ -86,40 +86,34 @@ def _depths(view: Photograph, others: Sequence[Photograph]) -> Depths:
 class _Image:
     """Brightness, with its mean and its variance over the window about each pixel."""
 
-    camera: Camera
     brightness: Float[Tensor, "height width"]
     mean: Float[Tensor, "height width"]
     variance: Float[Tensor, "height width"]
 
     @staticmethod
-    def of(view: Photograph) -> "_Image":
-        return _Image.filtered(view.camera, view.image.mean(-1))
-
-    @staticmethod
-    def filtered(camera: Camera, brightness: Float[Tensor, "height width"]) -> "_Image":
-        mean = _mean(brightness)
-        return _Image(camera, brightness, mean, (_mean(brightness.square()) - mean.square()).clamp_min(0))
+    def of(brightness: Float[Tensor, "height width"]) -> "_Image":
+        mean, variance = about(brightness[None], WINDOW)
+        return _Image(brightness, mean[0], variance[0])
 
 
 def _alike(
-    here: _Image, others: Sequence[_Image], points: Float[Tensor, "height width 3"]
+    here: _Image, others: Sequence[Photograph], points: Float[Tensor, "height width 3"]
 ) -> Float[Tensor, "height width"]:
     """The correlation with the best partners, if pixels show these points."""
     found = torch.stack([_correlation(here, other, points) for other in others])
     return found.topk(min(BEST, len(found)), dim=0).values.mean(0)
 
 
-def _correlation(here: _Image, other: _Image, points: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width"]:
+def _correlation(
+    here: _Image, other: Photograph, points: Float[Tensor, "height width 3"]
+) -> Float[Tensor, "height width"]:
     """Of windows about each pixel and about where the other view shows its point; −1 where there is nothing to see."""
     pixels, depths = other.camera.project(points)
     size = pixels.new_tensor([other.camera.width, other.camera.height])
     grid = (2 * pixels / size - 1)[None]
-    seen = grid_sample(other.brightness[None, None], grid, padding_mode="border", align_corners=False)[0, 0]
-    there = _Image.filtered(here.camera, seen)
-    together = _mean(here.brightness * seen) - here.mean * there.mean
+    brightness = other.image.mean(-1)[None, None]
+    seen = grid_sample(brightness, grid, padding_mode="border", align_corners=False)[0, 0]
+    there = _Image.of(seen)
+    together = windowed((here.brightness * seen)[None], WINDOW)[0] - here.mean * there.mean
     found = together / (here.variance * there.variance).sqrt().clamp_min(EVEN / 10)
     return torch.where(other.camera.shows(pixels, depths) & (there.variance > EVEN), found, -1.0)
-
-
-def _mean(image: Float[Tensor, "height width"]) -> Float[Tensor, "height width"]:
-    return avg_pool2d(image[None, None], WINDOW, 1, WINDOW // 2, count_include_pad=False)[0, 0]
