@@ -12,7 +12,7 @@ ORDER = [
     *("trace", "pyramid", "fast", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photographs", "reconstruction"),
-    *("pages", "evaluation", "cli"),
+    *("pages", "evaluation", "cli", "__main__"),
 ]
 SHELL = set(ORDER[ORDER.index("pages") :])
 FILES = {path.relative_to(SOURCE).with_suffix("").as_posix(): path for path in SOURCE.rglob("*.py")}
