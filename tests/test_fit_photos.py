@@ -21,7 +21,7 @@ from distrace.photographs.regions import Regions, appearance
 from distrace.photographs.residuals import PhotoProblem, Shape
 from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
-from distrace.rays import Rays, meet_sphere
+from distrace.rays import meet_sphere
 from distrace.render import render
 
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
@@ -68,7 +68,7 @@ def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> fl
     """Root mean square, over the surface of the true shape in its place, of the field of another in its own."""
     points = torch.cat([render(decoder.field(TRUE), camera).points for camera in ring(6, 24)])
     world = (place or Similarity.identity()).to_world(points)
-    there = shape.place.rays_in_object(Rays(world, world)).origins
+    there = shape.place.to_object(world)
     return float(decoder.field(PRIOR.code(shape.w))(there).square().mean().sqrt())
 
 

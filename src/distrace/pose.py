@@ -82,19 +82,22 @@ class Similarity:
     def to_world(self, points_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         return self.scale * self.turned(points_object) + self.translation
 
+    def to_object(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        return (points_world - self.translation) @ self.rotation / self.scale
+
     def turned(self, vectors_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
         """Directions of the object, in the world."""
         return vectors_object @ self.rotation.T
 
     def rays_in_object(self, rays: Rays) -> Rays:
         """Rays of the world as the object has them; distances along them are divided by the scale."""
-        return Rays((rays.origins - self.translation) @ self.rotation / self.scale, rays.directions @ self.rotation)
+        return Rays(self.to_object(rays.origins), rays.directions @ self.rotation)
 
     def camera_in_object(self, camera: Camera) -> Camera:
         """The camera that sees the object in its own frame as the given one does in the world; depths are divided."""
         pose = camera.T_world_camera.clone()
         pose[:3, :3] = self.rotation.T @ pose[:3, :3]
-        pose[:3, 3] = (pose[:3, 3] - self.translation) @ self.rotation / self.scale
+        pose[:3, 3] = self.to_object(pose[:3, 3])
         return replace(camera, T_world_camera=pose)
 
     def moved(self, step: Float[Tensor, "7"]) -> "Similarity":

@@ -131,7 +131,7 @@ class Stage:
         other = partner[row, column]
         points, normal = points_object[row], normals(sdf, points_object)[row]
         eyes = torch.stack([picture.camera.T_world_camera[:3, 3] for picture in self.pictures])[other]
-        to_eye = place.rays_in_object(Rays(eyes, eyes)).origins - points
+        to_eye = place.to_object(eyes) - points
         rays = Rays(points, to_eye / to_eye.norm(dim=-1, keepdim=True))
         seen = (rays.directions * normal).sum(-1) > FACING
         for number, picture in enumerate(self.pictures):
