@@ -5,9 +5,6 @@ A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParam
 """
 
 import json
-import pickle
-import re
-import warnings
 from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -19,13 +16,11 @@ from torch import Tensor
 
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
+from distrace.experiment import read_weights, write_weights
 from distrace.field import SDF
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
-LATEST = "latest.pth"
-BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
-SPLINES = "latent_fields_state_dict"
 
 
 @dataclass(frozen=True)
@@ -71,7 +66,7 @@ def load_model(name: str | Path) -> Model:
         raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
     specs, shapes = _read_specs(folder)
     ours = folder / "model.safetensors"
-    source, state, codes = _read_safetensors(ours) if ours.exists() else _read_deepsdf(folder)
+    source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
     with explained(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
         decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
     decoder = _filled(decoder, state, source)
@@ -95,23 +90,8 @@ def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -
 
 def save_experiment(folder: Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
     """Writes DeepSDF's own layout, with the key names that its original code reads."""
-    state = {_classic(key): value.detach().cpu() for key, value in decoder.state_dict().items()}
     _write_specs(folder, decoder.specs, shapes)
-    with written(folder / "ModelParameters" / LATEST) as file:
-        torch.save({"epoch": 0, "model_state_dict": state}, file)
-    with written(folder / "LatentCodes" / LATEST) as file:
-        torch.save({"epoch": 0, "latent_codes": {"weight": codes.detach().cpu()}}, file)
-
-
-def _classic(key: str) -> str:
-    key = key.replace("parametrizations.weight.original0", "weight_g")
-    return "module." + key.replace("parametrizations.weight.original1", "weight_v")
-
-
-def _modern(key: str) -> str:
-    key = key.removeprefix("module.")
-    key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
-    return re.sub(r"weight_v$", "parametrizations.weight.original1", key)
+    write_weights(folder, decoder, codes)
 
 
 def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> None:
@@ -163,49 +143,6 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
         tensors = {key: tensor.float() for key, tensor in safetensors.torch.load_file(path).items()}
         codes = tensors.pop("codes")
     return path, tensors, codes
-
-
-def _read_deepsdf(folder: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
-    weights = _checkpoint(folder / "ModelParameters")
-    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict"):
-        stored = _unpickled(weights)["model_state_dict"]
-        state = {_modern(key): tensor.float() for key, tensor in stored.items() if BESIDE not in key}
-    latent = folder / "LatentCodes" / weights.name
-    if not latent.is_file():
-        raise ValueError(f"{latent} is missing: the codes that belong to {weights.name} of ModelParameters")
-    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes"):
-        codes = _codes(_unpickled(latent))
-    return weights, state, codes
-
-
-def _unpickled(path: Path) -> dict:
-    """A file of tensors, and nothing that a pickle could run."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            return torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, KeyError):
-        raise ValueError("it holds something else than tensors; nothing in it was run") from None
-
-
-def _checkpoint(folder: Path) -> Path:
-    """`latest.pth`, or else the one of the most epochs."""
-    found = sorted(folder.glob("*.pth"), key=lambda path: int(path.stem) if path.stem.isdecimal() else -1)
-    if not found:
-        raise ValueError(f"{folder} holds no checkpoint; {LATEST} or one named by its epoch (2000.pth) is looked for")
-    return folder / LATEST if (folder / LATEST) in found else found[-1]
-
-
-def _codes(content: dict) -> Float[Tensor, "shapes length"]:
-    """A code per shape; or, where codes vary over space (DeepSDFStruct's latent fields), all their control points."""
-    if SPLINES in content:  # their `latent_codes` are zeros
-        return torch.cat([value.float() for key, value in content[SPLINES].items() if key.endswith("control_points")])
-    stored = content["latent_codes"]
-    if isinstance(stored, dict):
-        stored = stored["weight"] if "weight" in stored else list(stored.values())
-    if isinstance(stored, list):
-        stored = torch.stack([code.reshape(-1) for code in stored])
-    return stored.detach().float().reshape(len(stored), -1)
 
 
 def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
