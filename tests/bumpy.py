@@ -4,8 +4,8 @@ from distrace.decoder import Decoder, NetworkSpecs
 from distrace.evaluation.growth import ball_decoder
 
 
-def bumpy_balls() -> Decoder:
+def bumpy_balls(radius: float = 0.6) -> Decoder:
     """Codes bend the ball."""
-    decoder = ball_decoder(NetworkSpecs(dims=(64,) * 3, code_length=4, latent_in=(), norm_layers=()), 0.6)
+    decoder = ball_decoder(NetworkSpecs(dims=(64,) * 3, code_length=4, latent_in=(), norm_layers=()), radius)
     decoder.lin0.weight[:, :4] *= 0.4
     return decoder

@@ -173,7 +173,7 @@ def _joined(units: Tensor, points: Tensor, weight: Tensor, bias: Tensor) -> Tens
     if not torch.is_autocast_enabled(points.device.type):
         return _linear(torch.cat([units, points], dim=-1), weight, bias)
     with torch.autocast(points.device.type, enabled=False):
-        placed = (F.linear(points, weight[:, -3:]) + bias).to(torch.get_autocast_dtype(points.device.type))
+        placed = (F.linear(points, weight[:, -3:].to(points)) + bias).to(torch.get_autocast_dtype(points.device.type))
     return F.linear(units, weight[:, :-3]) + placed if units.shape[-1] else placed
 
 

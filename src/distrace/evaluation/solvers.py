@@ -26,7 +26,7 @@ from distrace.metrics import chamfer
 
 ADAM = FitConfig(iterations=200, starts=1)
 # Adam's own loss, far down
-SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, robust=0, compared=Comparison())
+SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, robust=0, sharpening=0, compared=Comparison())
 POINTS = (100,)  # observed depths; 0: all of them
 RAYS = 1000  # with a depth, and as many of the silhouette, on which the loss of every curve is measured
 RESOLUTION = 128  # of the meshes that are compared

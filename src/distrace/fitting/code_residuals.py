@@ -8,20 +8,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.decoder import CPU_CHUNK, Decoder
-from distrace.field import Counted
+from distrace.field import SDF, Counted
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals
 from distrace.fitting.targets import Targets
 from distrace.losses import Weights
 from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.rounded import quickest
 from distrace.surface import minimum
 from distrace.trace import TraceConfig, sphere_trace
 
 BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
-WATCHED = 0.075  # … and those that come closer than this are looked at after each step, …
-WINDOW = 0.1  # … so far before and behind where they came closest; the others when a stage begins
-REACH, ROUNDS = 0.05, 2  # … to two thousandths
+WATCHED = 0.075  # … and those that come closer than this after each step; the others when a stage begins
+REACH, ROUNDS = 0.05, 2  # to two thousandths
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
 PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
@@ -47,6 +47,7 @@ class Seen:
     observed: Float[Tensor, "n"]  # distance; `inf` where unknown
     is_object: Bool[Tensor, "n"]
     weights: Float[Tensor, "n"]
+    touches: Bool[Tensor, "n"]  # of object rays: along the outline, where the field is to vanish, not to be below zero
 
     @staticmethod
     def of(targets: Sequence[Targets], weights: Weights) -> "Seen":
@@ -56,10 +57,10 @@ class Seen:
             depth, mask = weights.depth / max(int(known.sum()), 1), weights.mask / max(len(known), 1)
             share = torch.where(known, depth, mask) / len(targets)
             observed = target.depth / target.camera.cosines(target.pixels)
-            parts.append((rays.origins, rays.directions, observed, target.is_object, share))
-        origins, directions, observed, is_object, share = (torch.cat(part) for part in zip(*parts))
+            parts.append((rays.origins, rays.directions, observed, target.is_object, share, target.touches))
+        origins, directions, *others = (torch.cat(part) for part in zip(*parts))
         rays = Rays(origins, directions)
-        return Seen(rays, meet_sphere(rays), observed, is_object, share)
+        return Seen(rays, meet_sphere(rays), *others)
 
     @property
     def known(self) -> Bool[Tensor, "n"]:
@@ -67,7 +68,8 @@ class Seen:
 
     def __getitem__(self, rows: Tensor) -> "Seen":
         bounds = Bounds(self.bounds.near[rows], self.bounds.far[rows])
-        return Seen(self.rays[rows], bounds, self.observed[rows], self.is_object[rows], self.weights[rows])
+        images = (self.observed, self.is_object, self.weights, self.touches)
+        return Seen(self.rays[rows], bounds, *(image[rows] for image in images))
 
 
 @dataclass(frozen=True)
@@ -94,45 +96,51 @@ class Problem:
 
     @torch.no_grad()
     def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
-        """Along all rays; those that ended on the surface last are followed from there on."""
-        near, far = self.seen.bounds.near, self.seen.bounds.far
+        """Along all rays; those that ended on the surface last are followed from there on.
+
+        Of those without a depth the ones that disagree with the mask are compared, and those that touch the shape,
+        where the field is least; those that are near to that are watched.
+        """
+        sdf, seen, near = self._field(w), self.seen, self.seen.bounds.near
         if last is not None:
-            near = torch.where(last.hit | self.seen.known, last.distance - BACK, near)
-        return self._look(w, self.seen, Bounds(near, far))
+            near = torch.where(last.hit | seen.known, last.distance - BACK, near)
+        t, hit = self._met(sdf, seen, near)
+        free = ~seen.known & ~seen.is_object & seen.bounds.meets
+        aside = (free & ~hit).nonzero()[:, 0]
+        values = sdf(seen.rays[aside].at(t[aside]))
+        close = free.clone()
+        free[aside], close[aside] = values < ATTENTION, values < WATCHED
+        lacking = ~seen.known & seen.is_object & seen.bounds.meets & (~hit | seen.touches)
+        wrong = free | lacking
+        t[wrong] = _lowest(sdf, seen[wrong], t[wrong])
+        self.evaluations += sdf.evaluations
+        return Look(w, t, hit, seen.known | wrong, seen.known | close | lacking)
 
     @torch.no_grad()
     def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
         """Along the rays that are watched, about where they ended last; the others stay as they were."""
-        rows = look.watched.nonzero()[:, 0]
-        seen, t, known = self.seen[rows], look.distance[rows], self.seen.known[rows]
-        near = (t - torch.where(known | look.hit[rows], BACK, WINDOW)).maximum(seen.bounds.near)
-        part = self._look(look.w + step, seen, Bounds(near, (t + WINDOW).minimum(seen.bounds.far)))
-        whole = (look.distance.clone(), look.hit.clone(), look.compared.clone())
-        for image, new in zip(whole, (part.distance, part.hit, part.compared), strict=True):
-            image[rows] = new
-        return Look(part.w, *whole, look.watched)
-
-    def _look(self, w: Float[Tensor, "dimensions"], seen: Seen, within: Bounds) -> Look:
-        """Rays with a depth are followed no farther than that.
-
-        Of the others those that disagree with the mask are compared, where the field is least; those that are near to
-        that are watched.
-        """
-        sdf, known = Counted(self.decoder.field(self.prior.code(w))), seen.known
-        far = torch.where(known, seen.observed.minimum(seen.bounds.far), within.far)
-        trace = sphere_trace(sdf, seen.rays, Bounds(seen.bounds.near, far), self.config.trace, within.near)
-        t = torch.where(trace.hit | ~known, trace.closest, seen.observed)
-        free = ~known & ~seen.is_object & seen.bounds.meets
-        aside = (free & ~trace.hit).nonzero()[:, 0]
-        values = sdf(seen.rays[aside].at(t[aside]))
-        close = free.clone()
-        free[aside], close[aside] = values < ATTENTION, values < WATCHED
-        lacking = ~known & seen.is_object & seen.bounds.meets & ~trace.hit
-        wrong = free | lacking
-        some = seen[wrong]
-        t[wrong] = minimum(sdf, some.rays, t[wrong], some.bounds, reach=REACH, refine=ROUNDS)
+        w, (t, hit, compared) = look.w + step, (image.clone() for image in (look.distance, look.hit, look.compared))
+        sdf = self._field(w)
+        rows = self.seen.known.nonzero()[:, 0]
+        t[rows], hit[rows] = self._met(sdf, self.seen[rows], t[rows] - BACK)
+        rows = (look.watched & ~self.seen.known).nonzero()[:, 0]
+        seen = self.seen[rows]
+        t[rows] = _lowest(sdf, seen, t[rows])
+        values = sdf(seen.rays.at(t[rows]))
+        hit[rows] = values <= 0
+        compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
         self.evaluations += sdf.evaluations
-        return Look(w, t, trace.hit, known | wrong, known | close | lacking)
+        return Look(w, t, hit, compared, look.watched)
+
+    def _field(self, w: Float[Tensor, "dimensions"]) -> Counted:
+        """To look along rays by, rounded where that is faster; residuals are not."""
+        return Counted(quickest(self.decoder).field(self.prior.code(w)))
+
+    def _met(self, sdf: Counted, seen: Seen, near: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
+        """Where rays meet the surface, and whether they do; those with a depth are followed no farther than that."""
+        far = torch.where(seen.known, seen.observed.minimum(seen.bounds.far), seen.bounds.far)
+        trace = sphere_trace(sdf, seen.rays, Bounds(seen.bounds.near, far), self.config.trace, near)
+        return torch.where(trace.hit | ~seen.known, trace.closest, seen.observed), trace.hit
 
     def residuals(self, look: Look) -> Residuals:
         """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
@@ -148,6 +156,7 @@ class Problem:
         slope, known = (gradient * rays.directions).sum(-1).abs(), seen.known[rows]
         before = torch.where(known, t - seen.observed[rows], 0.0)
         lacking = torch.where(seen.is_object[rows], values.clamp_min(0), (values - self.config.margin).clamp_max(0))
+        lacking = torch.where(seen.touches[rows], values, lacking)
         along = torch.where(known, 1 / slope.clamp_min(GRAZING), 1.0)
         values = torch.where(known, values + before * slope, lacking) * along
         jacobian = (by_code @ self.prior.basis * along[:, None]).masked_fill((values == 0)[:, None], 0.0)
@@ -157,11 +166,16 @@ class Problem:
     def terms(self, look: Look, residuals: Residuals) -> dict[str, float]:
         """The parts of Adam's loss, its depths measured from the surface: what of all scales can be compared."""
         rows = look.compared.nonzero()[:, 0]
-        known, is_object = self.seen.known[rows], self.seen.is_object[rows]
+        known, is_object, touches = (image[rows] for image in (self.seen.known, self.seen.is_object, self.seen.touches))
         lacking = residuals.values[: len(rows)].abs() * self.seen.weights[rows]
-        kinds = {"depth": known, "missing": ~known & is_object, "extra": ~known & ~is_object}
+        kinds = {"depth": known, "missing": ~known & is_object & ~touches, "extra": ~known & ~is_object}
+        kinds |= {"outline": touches} if touches.any() else {}
         code = self.config.weights.code * look.w.square().mean()
         return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
+
+
+def _lowest(sdf: SDF, seen: Seen, t: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    return minimum(sdf, seen.rays, t, seen.bounds, reach=REACH, refine=ROUNDS)
 
 
 def with_prior(

@@ -1,7 +1,7 @@
 """Fitting a shape's code by Levenberg–Marquardt, to views or to points: a tenth of Adam's steps, hardly dearer ones."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -17,11 +17,12 @@ from distrace.fitting.fit import pools_of
 from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.prior import Prior
-from distrace.fitting.solver import Kernel, SolverConfig, cauchy, charbonnier, minimise
+from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, stages_of
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.losses import Weights
+from distrace.rounded import quickest
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
 
@@ -39,6 +40,8 @@ class CodeFitConfig(Starts):
     depth_rays: int = 1000  # of each view
     mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates
     first_share: float = 0.3  # of them, in the first stage: while all is coarse
+    sharpening: int = 6  # steps at the end, from the best one, in which …
+    outline_rays: int = 600  # … so many rays are to touch the surface
     compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
     narrowing: float = 0.42  # … and × this from one stage to the next
@@ -48,8 +51,14 @@ class CodeFitConfig(Starts):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.stages < 1:
-            raise ValueError(f"{self.stages} stages were asked for; there must be at least 1")
+        if self.stages < 1 or self.sharpening < 0:
+            given = f"{self.stages} stages and {self.sharpening} steps of sharpening"
+            raise ValueError(f"{given} were asked for; there must be at least 1 stage")
+
+    @property
+    def total(self) -> int:
+        """Steps at most: where no silhouette is known it is not sharpened."""
+        return super().total + (self.sharpening + 1 if self.sharpening else 0)
 
     def scale_and_kernel(self, stage: int) -> tuple[float, Kernel]:
         """A stage's scale, and how what is beyond it counts."""
@@ -61,14 +70,14 @@ class CodeFitConfig(Starts):
 def fit_code(
     decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
 ) -> Iterator[Step]:
-    """Fits a code to views, from several starts; the end that contradicts the views least is the last step again.
+    """Fits a code to views, from several starts; the end that contradicts the views least is taken to their outlines.
 
-    Raises `ValueError` without views, or with one from inside the mean shape.
+    The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
 
-    def seen(random: torch.Generator, depths: int, silhouette: int) -> Seen:
-        return Seen.of([pool.draw(depths, silhouette, random) for pool in pools], config.compared.weights)
+    def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
+        return Seen.of([pool.draw(depths, silhouette, random, touching) for pool in pools], config.compared.weights)
 
     def problem(random: torch.Generator, share: float) -> Problem:
         some = seen(random, config.depth_rays, round(config.mask_rays * share))
@@ -80,7 +89,40 @@ def fit_code(
         return contradiction(sdf, others, config.compared.trace)
 
     random = torch.Generator().manual_seed(config.seed)
-    return _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
+    steps = _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
+    if not config.sharpening or not any(len(pool.between) for pool in pools):
+        return steps
+    random_sharp = torch.Generator().manual_seed(config.seed + 2)
+    sharp = seen(random_sharp, config.depth_rays, config.mask_rays // 2, config.outline_rays)
+    return _then_sharpened(steps, Problem(decoder, prior, sharp, config.compared), config, verdict)
+
+
+def _then_sharpened(
+    steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Callable[[SDF, Step], float]
+) -> Iterator[Step]:
+    """Steps, and from where they end others that bring the surface to the outline itself; the better end comes last.
+
+    From farther away such rays, which pull from both sides, lead to other ends more often than they help.
+    """
+    best = yield from _passed(steps)
+    step, problem.scale, w = best, config.outlying, problem.prior.coordinates(best.code)
+    solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
+    for step, _ in _stage(problem, w, None, solver, best.start, best.iteration):
+        yield step
+    began = time.perf_counter()
+    fields = [Counted(quickest(problem.decoder).field(each.code)) for each in (best, step)]
+    before, after = (verdict(sdf, best) for sdf in fields)
+    evaluations = sum(sdf.evaluations for sdf in fields)
+    yield replace(step if after < before else best, seconds=time.perf_counter() - began, evaluations=evaluations)
+
+
+def _passed(steps: Iterator[Step]) -> Generator[Step, None, Step]:
+    """All of them; the last one is returned, too."""
+    step = next(steps)
+    yield step
+    for step in steps:
+        yield step
+    return step
 
 
 def fit_points(
@@ -125,7 +167,7 @@ def _best(
         return _solved(problem_of, prior, config, start, first.coordinates[start])
 
     def judge(step: Step) -> Step:
-        began, sdf = time.perf_counter(), Counted(decoder.field(step.code))
+        began, sdf = time.perf_counter(), Counted(quickest(decoder).field(step.code))
         return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
     steps = best_of(config, run, judge, recent=1)
@@ -138,20 +180,30 @@ def _solved(
     problem_of: ProblemOf, prior: Prior, config: CodeFitConfig, start: int, w: Float[Tensor, "dimensions"]
 ) -> Iterator[Step]:
     """From one start, on the same rays or points as from the others."""
-    began, done, evaluations, damping = time.perf_counter(), 0, 0, config.damping
-    random = torch.Generator().manual_seed(config.seed)
+    done, damping, random = 0, config.damping, torch.Generator().manual_seed(config.seed)
     problem: Any = None
-    state = None
+    state: Any = None
     for stage, length in stages_of(config.iterations, config.stages):
         if problem is None or stage < 2:
-            problem, state, evaluations = problem_of(random, 1.0 if stage else config.first_share), None, 0
+            problem, state = problem_of(random, 1.0 if stage else config.first_share), None
         problem.scale, kernel = config.scale_and_kernel(stage)
-        state = problem.look(w, state)
         solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
-        for solution in minimise(problem.residuals, state, problem.moved, solver):
-            state, damping, done = solution.state, solution.damping, done + 1
-            terms = problem.terms(state, solution.residuals)
-            seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
-            w = state.w
-            yield Step(start, done, sum(terms.values()), terms, prior.code(w), seconds, evaluations - before)
-            began = time.perf_counter()
+        for step, solution in _stage(problem, w, state, solver, start, done):
+            yield step
+            done, damping, state, w = step.iteration, solution.damping, solution.state, solution.state.w
+
+
+def _stage(
+    problem: Any, w: Float[Tensor, "dimensions"], last: Any, solver: SolverConfig, start: int, done: int
+) -> Iterator[tuple[Step, Solution]]:
+    """A look at all that is compared, and steps from there; the first is charged with the look."""
+    began, asked = time.perf_counter(), problem.evaluations
+    for solution in minimise(problem.residuals, problem.look(w, last), problem.moved, solver):
+        done, terms, code = (
+            done + 1,
+            problem.terms(solution.state, solution.residuals),
+            problem.prior.code(solution.state.w),
+        )
+        seconds, evaluations = time.perf_counter() - began, problem.evaluations - asked
+        yield Step(start, done, sum(terms.values()), terms, code, seconds, evaluations), solution
+        began, asked = time.perf_counter(), problem.evaluations

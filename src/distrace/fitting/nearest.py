@@ -11,6 +11,7 @@ from torch import Tensor
 from distrace.decoder import FAR, Decoder
 from distrace.fitting.code_residuals import Seen
 from distrace.fitting.prior import Prior
+from distrace.rounded import Rounded, quickest
 
 DEPTHS, SILHOUETTE = 100, 300  # rays of a view that hints are taken from
 FREE = 3.0  # × counts, in the mean, what is inside and should not be: a point in the free space seldom says anything
@@ -38,7 +39,7 @@ class Hints:
         return Hints(torch.cat(points), torch.cat(distances))
 
     @torch.no_grad()
-    def contradicted(self, decoder: Decoder, codes: Float[Tensor, "codes length"]) -> Float[Tensor, "codes"]:
+    def contradicted(self, decoder: Decoder | Rounded, codes: Float[Tensor, "codes length"]) -> Float[Tensor, "codes"]:
         """How far, in the mean, each shape is from being as it is known to be."""
         free, together = self.distances.isinf(), max(AT_ONCE // max(len(self.points), 1), 1)
         parts = [decoder(self.points.expand(len(some), -1, -1), some[:, None]) for some in codes.split(together)]
@@ -63,13 +64,13 @@ class First:
 def first_of(decoder: Decoder, prior: Prior, hints: Hints, count: int, seed: int) -> First:
     """The mean's coordinates, those of the nearest training codes and, if these are too few, draws."""
     began = time.perf_counter()
-    codes, evaluations = _nearest(decoder, prior.codes, hints, count - 1)
+    codes, evaluations = _nearest(quickest(decoder), prior.codes, hints, count - 1)
     nearest = [prior.coordinates(code) for code in codes]
     draws = [prior.start(k, seed) for k in range(len(nearest) + 1, count)]
     return First([prior.start(0, seed), *nearest, *draws], time.perf_counter() - began, evaluations)
 
 
-def _nearest(decoder: Decoder, codes: Sequence[Tensor], hints: Hints, count: int) -> tuple[list[Tensor], int]:
+def _nearest(decoder: Decoder | Rounded, codes: Sequence[Tensor], hints: Hints, count: int) -> tuple[list[Tensor], int]:
     """The codes that contradict the hints least, and how often the field was asked for."""
     left, evaluations = torch.stack(list(codes)) if codes else torch.empty(0), 0
     if not count or not len(left):

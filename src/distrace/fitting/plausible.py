@@ -20,7 +20,7 @@ from distrace.fitting.methods import completing
 from distrace.fitting.prior import DEVIATION, Prior, prior_of
 from distrace.fitting.starts import Step
 
-CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0)
+CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0, sharpening=0)
 
 
 def plausible(

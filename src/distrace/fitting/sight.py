@@ -8,7 +8,7 @@ from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from distrace.data.view import View
-from distrace.fitting.targets import band, drawn
+from distrace.fitting.targets import band, drawn, middles
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,7 @@ def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "heigh
 
     At most `count`, drawn at random.
     """
-    middles = []
-    for axis in (0, 1):
-        length = mask.shape[axis] - 1
-        (first, second), (here, there) = ([image.narrow(axis, k, length) for k in (0, 1)] for image in (mask, centres))
-        middles.append(((here + there) / 2)[first != second])
-    pixels = torch.cat(middles)
-    pixels = drawn(pixels, count, torch.Generator().manual_seed(0))
+    pixels = drawn(middles(mask, centres), count, torch.Generator().manual_seed(0))
     every, nothing = torch.ones_like(pixels[:, 0], dtype=torch.bool), pixels.new_zeros(len(pixels), 3)
     return Sight(pixels, torch.full_like(pixels[:, 0], torch.inf), every, every, nothing, nothing[:, :2])
 
