@@ -122,11 +122,13 @@ def _others(task: Task) -> Iterator[Step]:
 def _story(task: Task, outcome: Outcome) -> report.Completion:
     """All that the page shows."""
     known, full, truth, last = task.shown(task.known), task.shown(task.full), task.truth, outcome.steps[-1]
-    losses: dict[str, list[float]] = {}
+    distinct: dict[tuple[int, int], Step] = {}
     for step in outcome.steps:
-        curve = losses.setdefault(f"start {step.start + 1}", [])
-        if step.iteration > len(curve):  # else it is the result, given again
-            curve.append(step.loss)
+        distinct.setdefault((step.start, step.iteration), step)  # the result is given again
+    losses: dict[str, list[float]] = {}
+    for step in distinct.values():
+        name = "outline" if "outline" in step.terms else f"start {step.start + 1}"
+        losses.setdefault(name, []).append(step.loss)
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, last.code)
         camera = task.camera.to(task.mesh.device)

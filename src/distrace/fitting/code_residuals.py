@@ -146,8 +146,8 @@ class Problem:
         """Along rays: how far the surface is from what was seen; and, for the prior, the coordinates themselves.
 
         Of a depth that is the field at the observed point over |∇f · v| there or, where the surface hides that point,
-        t − t_observed; of an object ray that misses the least value; of a ray of the background what that lacks to the
-        margin. All change with the code as f does at a fixed point.
+        t − t_observed; of an object ray that misses, and of one that is to touch, the least value; of a ray of the
+        background what that lacks to the margin. All change with the code as f does at a fixed point.
         """
         seen, rows = self.seen, look.compared.nonzero()[:, 0]
         rays, t = seen.rays[rows], look.distance[rows]
