@@ -38,9 +38,12 @@ class Rounded:
 
 
 def quickest(decoder: Decoder) -> Decoder | Rounded:
-    """The decoder as it is, or rounded: on a CPU that multiplies in bfloat16. Others emulate that, and take longer."""
+    """The decoder as it is, or rounded: on a CPU that multiplies in bfloat16. Others emulate that, and take longer.
+
+    A decoder of another class is asked as it is: it may have another field.
+    """
     parameter = next(decoder.parameters())
-    if parameter.device.type != "cpu" or parameter.dtype != torch.float32:
+    if type(decoder) is not Decoder or parameter.device.type != "cpu" or parameter.dtype != torch.float32:
         return decoder
     return Rounded(decoder) if _multiplies_in_bfloat16() else decoder
 
