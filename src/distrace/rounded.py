@@ -14,7 +14,7 @@ class Rounded:
     """The same shapes; values near the surface of an 8 × 512 decoder are off by 1e-4 to 3e-4, and by 1e-3 at most."""
 
     def __init__(self, decoder: Decoder) -> None:
-        self.decoder, self.specs = decoder, decoder.specs
+        self.decoder = decoder
 
     def __call__(
         self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]

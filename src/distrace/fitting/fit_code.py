@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -25,6 +26,7 @@ from distrace.losses import Weights
 from distrace.rounded import quickest
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]
+Verdict = Callable[[SDF, Step], float]
 
 
 @dataclass(frozen=True)
@@ -92,14 +94,12 @@ def fit_code(
     steps = _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
     if not config.sharpening or not any(len(pool.between) for pool in pools):
         return steps
-    random_sharp = torch.Generator().manual_seed(config.seed + 2)
-    sharp = seen(random_sharp, config.depth_rays, config.mask_rays // 2, config.outline_rays)
+    random = torch.Generator().manual_seed(config.seed + 2)
+    sharp = seen(random, config.depth_rays, config.mask_rays // 2, config.outline_rays)
     return _then_sharpened(steps, Problem(decoder, prior, sharp, config.compared), config, verdict)
 
 
-def _then_sharpened(
-    steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Callable[[SDF, Step], float]
-) -> Iterator[Step]:
+def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Verdict) -> Iterator[Step]:
     """Steps, and from where they end others that bring the surface to the outline itself; the better end comes last.
 
     From farther away such rays, which pull from both sides, lead to other ends more often than they help.
@@ -109,11 +109,9 @@ def _then_sharpened(
     solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
     for step, _ in _stage(problem, w, None, solver, best.start, best.iteration):
         yield step
-    began = time.perf_counter()
-    fields = [Counted(quickest(problem.decoder).field(each.code)) for each in (best, step)]
-    before, after = (verdict(sdf, best) for sdf in fields)
-    evaluations = sum(sdf.evaluations for sdf in fields)
-    yield replace(step if after < before else best, seconds=time.perf_counter() - began, evaluations=evaluations)
+    before, after = (_judged(problem.decoder, verdict, end) for end in (best, step))
+    seconds, evaluations = before.seconds + after.seconds, before.evaluations + after.evaluations
+    yield replace(step if after.loss < before.loss else best, seconds=seconds, evaluations=evaluations)
 
 
 def _passed(steps: Iterator[Step]) -> Generator[Step, None, Step]:
@@ -158,7 +156,7 @@ def _best(
     hints: Hints,
     problem_of: ProblemOf,
     config: CodeFitConfig,
-    verdict: Callable[[SDF, Step], float],
+    verdict: Verdict,
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best."""
     first = first_of(decoder, prior, hints, config.starts, config.seed)
@@ -166,14 +164,16 @@ def _best(
     def run(start: int) -> Iterator[Step]:
         return _solved(problem_of, prior, config, start, first.coordinates[start])
 
-    def judge(step: Step) -> Step:
-        began, sdf = time.perf_counter(), Counted(quickest(decoder).field(step.code))
-        return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
-
-    steps = best_of(config, run, judge, recent=1)
+    steps = best_of(config, run, partial(_judged, decoder, verdict), recent=1)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps
+
+
+def _judged(decoder: Decoder, verdict: Verdict, step: Step) -> Step:
+    """A step with the verdict on its shape as its loss, and what that took."""
+    began, sdf = time.perf_counter(), Counted(quickest(decoder).field(step.code))
+    return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
 
 def _solved(
@@ -199,11 +199,8 @@ def _stage(
     """A look at all that is compared, and steps from there; the first is charged with the look."""
     began, asked = time.perf_counter(), problem.evaluations
     for solution in minimise(problem.residuals, problem.look(w, last), problem.moved, solver):
-        done, terms, code = (
-            done + 1,
-            problem.terms(solution.state, solution.residuals),
-            problem.prior.code(solution.state.w),
-        )
+        done, state = done + 1, solution.state
+        terms, code = problem.terms(state, solution.residuals), problem.prior.code(state.w)
         seconds, evaluations = time.perf_counter() - began, problem.evaluations - asked
         yield Step(start, done, sum(terms.values()), terms, code, seconds, evaluations), solution
         began, asked = time.perf_counter(), problem.evaluations
