@@ -10,11 +10,13 @@ from bumpy import bumpy_balls
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
-from distrace.fitting.code_residuals import Comparison, Problem, Seen, derivatives
+from distrace.fitting.by_code import derivatives
+from distrace.fitting.code_residuals import Comparison, Problem
 from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.fitting.nearest import Hints, first_of
 from distrace.fitting.point_residuals import PointProblem, misfit
 from distrace.fitting.prior import Prior
+from distrace.fitting.seen import Seen
 from distrace.fitting.solver import SolverConfig, minimise
 from distrace.fitting.starts import Step, stages_of
 from distrace.fitting.targets import Pool

@@ -5,7 +5,8 @@ import torch
 
 from distrace.camera import Camera
 from distrace.data.view import View
-from distrace.fitting.code_residuals import Comparison, Seen
+from distrace.fitting.code_residuals import Comparison
+from distrace.fitting.seen import Seen
 from distrace.fitting.targets import Pool
 from distrace.fitting.verdict import MOST, contradiction
 from distrace.losses import Weights

@@ -1,19 +1,19 @@
-"""What the shape of a code lacks of observed views: residuals on rays, and their exact derivatives by the code."""
+"""What the shape of a code lacks of observed views: residuals on rays, and their exact derivatives."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
+from distrace.fitting.by_code import derivatives, with_prior
 from distrace.fitting.prior import Prior
+from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Residuals
-from distrace.fitting.targets import Targets
 from distrace.losses import Weights
-from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.rays import Bounds
 from distrace.rounded import quickest
 from distrace.surface import minimum
 from distrace.trace import TraceConfig, sphere_trace
@@ -23,8 +23,6 @@ ATTENTION = 0.025  # rays of the background that come closer than this are searc
 WATCHED = 0.075  # … and those that come closer than this after each step; the others when a stage begins
 REACH, ROUNDS = 0.05, 2  # to two thousandths
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
-SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
-PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
 
 
 @dataclass(frozen=True)
@@ -36,40 +34,6 @@ class Comparison:
     trace: TraceConfig = field(
         default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
     )
-
-
-@dataclass(frozen=True)
-class Seen:
-    """Rays of all views, and what was seen there. A weight is a ray's share of its term of the loss."""
-
-    rays: Rays
-    bounds: Bounds
-    observed: Float[Tensor, "n"]  # distance; `inf` where unknown
-    is_object: Bool[Tensor, "n"]
-    weights: Float[Tensor, "n"]
-    touches: Bool[Tensor, "n"]  # of object rays: along the outline, where the field is to vanish, not to be below zero
-
-    @staticmethod
-    def of(targets: Sequence[Targets], weights: Weights) -> "Seen":
-        parts = []
-        for target in targets:
-            rays, known = target.camera.rays(target.pixels), target.depth.isfinite()
-            depth, mask = weights.depth / max(int(known.sum()), 1), weights.mask / max(len(known), 1)
-            share = torch.where(known, depth, mask) / len(targets)
-            observed = target.depth / target.camera.cosines(target.pixels)
-            parts.append((rays.origins, rays.directions, observed, target.is_object, share, target.touches))
-        origins, directions, *others = (torch.cat(part) for part in zip(*parts))
-        rays = Rays(origins, directions)
-        return Seen(rays, meet_sphere(rays), *others)
-
-    @property
-    def known(self) -> Bool[Tensor, "n"]:
-        return self.observed.isfinite()
-
-    def __getitem__(self, rows: Tensor) -> "Seen":
-        bounds = Bounds(self.bounds.near[rows], self.bounds.far[rows])
-        images = (self.observed, self.is_object, self.weights, self.touches)
-        return Seen(self.rays[rows], bounds, *(image[rows] for image in images))
 
 
 @dataclass(frozen=True)
@@ -176,36 +140,3 @@ class Problem:
 
 def _lowest(sdf: SDF, seen: Seen, t: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
     return minimum(sdf, seen.rays, t, seen.bounds, reach=REACH, refine=ROUNDS)
-
-
-def with_prior(
-    values: Float[Tensor, "n"],
-    jacobian: Float[Tensor, "n dimensions"],
-    weights: Float[Tensor, "n"],
-    w: Float[Tensor, "dimensions"],
-    weight: float,
-) -> Residuals:
-    """With residuals for the prior, whose loss is weight × the mean squared coordinate."""
-    count = len(w)
-    return Residuals(
-        torch.cat([values, SMALL * w]),
-        torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
-        torch.cat([weights, values.new_full((count,), 2 * weight / count / SMALL**2)]),
-    )
-
-
-def derivatives(
-    decoder: Decoder, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
-    """Values, and their derivatives by the point and by the code: every point has a copy of the code for its own."""
-    parts = [_derivatives(decoder, part, code) for part in points.split(PART)]
-    values, by_point, by_code = (torch.cat(part) for part in zip(*parts))
-    return values, by_point, by_code
-
-
-@torch.enable_grad()
-def _derivatives(decoder: Decoder, points: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    points, codes = points.detach().requires_grad_(), code.detach().repeat(len(points), 1).requires_grad_()
-    values = decoder(points, codes)
-    by_point, by_code = torch.autograd.grad(values.sum(), (points, codes))
-    return values.detach(), by_point, by_code

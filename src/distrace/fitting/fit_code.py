@@ -13,11 +13,12 @@ from torch import Tensor
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
 from distrace.field import SDF, Counted
-from distrace.fitting.code_residuals import Comparison, Problem, Seen
+from distrace.fitting.code_residuals import Comparison, Problem
 from distrace.fitting.fit import pools_of
 from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.prior import Prior
+from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, stages_of
 from distrace.fitting.targets import drawn

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from distrace.decoder import FAR, Decoder
 from distrace.field import SDF
-from distrace.fitting.code_residuals import derivatives, with_prior
+from distrace.fitting.by_code import derivatives, with_prior
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals
 from distrace.fitting.targets import drawn

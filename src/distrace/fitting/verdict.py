@@ -3,7 +3,7 @@
 import torch
 
 from distrace.field import SDF
-from distrace.fitting.code_residuals import Seen
+from distrace.fitting.seen import Seen
 from distrace.metrics import iou
 from distrace.trace import TraceConfig, sphere_trace
 

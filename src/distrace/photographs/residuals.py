@@ -15,7 +15,7 @@ from torch import Tensor
 
 from distrace.decoder import Decoder
 from distrace.field import Counted
-from distrace.fitting.code_residuals import SMALL, derivatives
+from distrace.fitting.by_code import SMALL, derivatives
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals, charbonnier
 from distrace.photographs.pairs import Colours
