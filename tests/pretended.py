@@ -93,8 +93,14 @@ def pretended(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
         monkeypatch.setattr(torch, name, _making(getattr(torch, name)))
     monkeypatch.setattr(torch, "autocast", lambda kind, *a, **k: _autocast(plain_autocast, kind, *a, **k))
     monkeypatch.setattr(torch, "is_autocast_enabled", lambda kind="cpu": False)
+    monkeypatch.setattr(Tensor, "__matmul__", _product)
     with _Pretending():
         yield
+
+
+def _product(one: Tensor, other: Tensor) -> Tensor:
+    """A vector with a matrix: PyTorch makes it a row, and takes that axis away in place, which nothing here can."""
+    return torch.matmul(one[None], other)[0] if (one.dim(), other.dim()) == (1, 2) else torch.matmul(one, other)
 
 
 def _making(make: Callable[..., Tensor]) -> Callable[..., Tensor]:

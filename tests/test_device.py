@@ -1,6 +1,7 @@
 """Commands on a device that is not the CPU: everything that meets is on one."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -11,14 +12,16 @@ from test_train import finished, spheres
 import distrace.cli.console
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
-from distrace.cli import _run
+from distrace.cli import _run, multiview
 from distrace.data.photograph import Photograph
+from distrace.data.photographs import Photographs, save_photographs
+from distrace.data.placement import Placement
 from distrace.data.view import View
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of
-from distrace.fitting.prior import prior_of
-from distrace.photographs.fit_photos import fit_photos
+from distrace.pages import views_page
+from distrace.photographs.fit_photos import PhotoConfig
 from distrace.render import render
 from distrace.training.train import TrainConfig
 
@@ -90,10 +93,32 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
             assert last.code.cpu().isfinite().all()
 
 
-def test_photographs_are_fitted_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    model = load_model("sofas")
-    views = [Photograph(f"{k}", Camera.orbit(40 * k, 20, 3, height=8, width=8), torch.rand(8, 8, 3)) for k in (0, 1)]
-    with pretended(monkeypatch):
-        moved = model.to("meta")
-        with pytest.raises(ValueError, match="photographs are fitted on the CPU"):
-            next(fit_photos(moved.decoder, views, prior_of(moved.codes)))
+@pytest.fixture
+def photographs(model: Path, tmp_path: Path) -> Path:
+    """Three of a sphere, of which the first has a mask."""
+    views = []
+    for k in range(3):
+        camera = Camera.orbit(25 * k, 20, 3, height=24, width=24, focal_px=30.0)
+        with torch.no_grad():
+            seen = render(load_model(model).field(1), camera)
+        image = torch.where(seen.mask[..., None], 0.5 + 0.4 * seen.normal, 0.1)
+        views.append(Photograph(f"{k}", camera, image, seen.mask if k == 0 else None))
+    placement = Placement(torch.zeros(3).double(), 1.0)
+    save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
+    return tmp_path / "views"
+
+
+@pytest.mark.parametrize("more", [(), ("--changing-light", "--fixed")])
+def test_photographs_are_brought_to_the_model(
+    more: tuple[str, ...],
+    model: Path,
+    photographs: Path,
+    command: Command,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for name in ("SHOWN", "FRAMES"):
+        monkeypatch.setattr(views_page, name, 1)
+    monkeypatch.setattr(multiview, "PhotoConfig", partial(PhotoConfig, iterations=3, trial=1, levels=(0.5, 1.0)))
+    command("multiview", model, photographs, *more, "--starts", 2, "--rays", 200, "--resolution", 16)
+    assert (tmp_path / "out" / "result.json").exists()

@@ -73,6 +73,9 @@ class Similarity:
     def identity() -> "Similarity":
         return Similarity(torch.eye(3), torch.zeros(3), torch.ones(()))
 
+    def to(self, device: torch.device | str) -> "Similarity":
+        return Similarity(self.rotation.to(device), self.translation.to(device), self.scale.to(device))
+
     @property
     def T_world_object(self) -> Float[Tensor, "4 4"]:
         matrix = torch.eye(4).to(self.rotation)

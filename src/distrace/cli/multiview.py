@@ -39,16 +39,18 @@ class Multiview:
     rays: int = Comparing.rays  # of all views, in each stage
     resolution: int = 256  # of the mesh
     seed: int = 0
+    device: str = "cpu"
 
     def run(self) -> None:
-        run, resolved = start(self.out), MeshConfig(self.resolution)
+        run = start(self.out, self.device)
+        resolved = MeshConfig(self.resolution, device=run.device)
         model, found = opened(self.model, run.device), load_photographs(self.views)
         console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}", markup=False)
         for note in notes(found):
             console.print(note, markup=False)
         if self.size < 8:
             raise ValueError(f"--size {self.size} was given; at least 8 pixels are needed")
-        views = [view.at_most(self.size) for view in found.views]
+        views = [view.at_most(self.size).to(run.device) for view in found.views]
         views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
         compared = Comparing(rays=self.rays, moves=not self.fixed, same_light=not self.changing_light)
         config = PhotoConfig(starts=self.starts, seed=self.seed, compared=compared)
@@ -62,7 +64,7 @@ class Multiview:
         mesh = _mesh(model, last, found, resolved)
         save_mesh(run.out / "mesh.ply", mesh)
         with written(run.out / "code.npy") as file:
-            np.save(file, last.code.numpy())
+            np.save(file, last.code.cpu().numpy())
         save_gif(run.out / "forming.gif", forming(model, steps, views[0].camera))
         save_text(run.out / "report.html", views_page(model, views, steps, agreed, mesh))
         run.finish(
@@ -91,7 +93,7 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> l
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> trimesh.Trimesh:
     """In the world of the folder."""
     mesh = extract_mesh(model.field(step.code), config)
-    mesh.apply_transform(step.place.T_world_object.numpy())
+    mesh.apply_transform(step.place.T_world_object.cpu().numpy())
     mesh.vertices = found.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
     return mesh
 

@@ -21,6 +21,10 @@ class Photograph:
     image: Float[Tensor, "height width 3"]
     mask: Bool[Tensor, "height width"] | None = None
 
+    def to(self, device: torch.device | str) -> "Photograph":
+        mask = None if self.mask is None else self.mask.to(device)
+        return Photograph(self.name, self.camera.to(device), self.image.to(device), mask)
+
     @property
     def known_mask(self) -> Bool[Tensor, "height width"]:
         """The mask; raises `ValueError` where there is none."""
@@ -56,7 +60,7 @@ def averaged(image: Tensor, factor: float) -> Float[Tensor, "height_ width_ chan
 def _averaged(image: Float[Tensor, "rows columns channels"], factor: float) -> Float[Tensor, "rows_ columns channels"]:
     """Along the rows, by differences of the integral: exact for any factor."""
     length = image.shape[0]
-    edges = torch.arange(math.ceil(length * factor) + 1, dtype=torch.float64) / factor
+    edges = torch.arange(math.ceil(length * factor) + 1, dtype=torch.float64, device=image.device) / factor
     start, end = edges[:-1].clamp_max(length - SLIVER), edges[1:].clamp_max(length)
     integral = torch.cat([torch.zeros_like(image[:1]), image.cumsum(0)])
     return (_between(integral, end) - _between(integral, start)) / (end - start)[:, None, None]

@@ -66,8 +66,8 @@ def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
     """The photograph with the outline of the shape, and the shape."""
     small = view.at_most(SIZE)
     buffers = _rendered(model, step, view.camera)
-    picture = colour_picture(small.image)
-    picture[band(buffers.mask, 3).numpy()] = EXTRA
+    picture = colour_picture(small.image.cpu())
+    picture[band(buffers.mask, 3).cpu().numpy()] = EXTRA
     return side_by_side([picture, View.of(buffers).shaded])
 
 

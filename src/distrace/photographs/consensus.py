@@ -8,7 +8,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import max_pool1d, pad
@@ -34,7 +33,7 @@ def _shown(camera: Camera, places: Float[Tensor, "places 3"]) -> Bool[Tensor, "h
     pixels, depth = camera.project(places)
     within = camera.shows(pixels, depth)
     column, row = pixels[within].long().T
-    shown = torch.zeros(camera.height, camera.width)
+    shown = places.new_zeros(camera.height, camera.width)
     shown[row, column] = 1.0
     if not within.any():
         return shown.bool()

@@ -68,14 +68,13 @@ def fit_photos(
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
     place: that given or, if it is unknown and they contradict it less there, where the photographs tell; the one whose
-    loss falls lowest goes on. On the CPU alone. Raises `ValueError` for fewer than two photographs, and for a decoder
-    on another device.
+    loss falls lowest goes on. On the prior's device, wherever the photographs are. Raises `ValueError` for fewer than
+    two of them.
     """
-    if prior.mean.device.type != "cpu":
-        raise ValueError(f"the decoder is on {prior.mean.device}; photographs are fitted on the CPU: move it there")
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
-    return _fitted(decoder, photographs, prior, config, place or Similarity.identity())
+    device, place = prior.mean.device, place or Similarity.identity()
+    return _fitted(decoder, [each.to(device) for each in photographs], prior, config, place.to(device))
 
 
 def _fitted(

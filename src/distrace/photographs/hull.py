@@ -111,9 +111,9 @@ def allowed(
     photographs: Sequence[Photograph], cells: int, wrong: float = WRONG, least: float = 0.0
 ) -> tuple[Float[Tensor, "places 3"], Bool[Tensor, "places"]]:
     """The middles of cells about the unit sphere, and which of them masks allow: but `wrong` of those that see it."""
-    steps = (torch.arange(cells) + 0.5) * 2 / cells - 1
+    steps = (torch.arange(cells, device=photographs[0].image.device) + 0.5) * 2 / cells - 1
     places = torch.cartesian_prod(steps, steps, steps)
-    seen, left_out = torch.zeros(len(places)), torch.zeros(len(places))
+    seen, left_out = torch.zeros_like(places[:, 0]), torch.zeros_like(places[:, 0])
     for each in photographs:
         inside, on_object = looked_up(each.camera, each.known_mask, places)
         seen += inside

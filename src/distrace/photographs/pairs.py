@@ -43,7 +43,7 @@ class Colours:
         """The pixels that show points, and how they move with them."""
         rotation, focal = self.camera.T_world_camera[:3, :3], self.camera.intrinsics[:2]
         pixels, depth = self.camera.project(points_world)
-        moved = (focal[None] - torch.cat([torch.zeros(len(pixels), 2, 2), pixels[..., None]], dim=-1)) @ rotation.T
+        moved = (focal[None] - torch.cat([pixels.new_zeros(len(pixels), 2, 2), pixels[..., None]], dim=-1)) @ rotation.T
         return pixels, moved / depth[:, None, None]
 
 

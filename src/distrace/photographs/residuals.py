@@ -6,7 +6,7 @@ slides along its ray, and with it its place in the other images.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import pairwise
 
 import torch
@@ -29,7 +29,7 @@ ATTENTION = 0.03  # rays of the background that come closer than this are search
 GRAZING = 0.2  # points that are seen more flatly slide as if they were seen so
 SATURATED = 3.0  # scales: outlines that are off by more hardly pull
 REACH, ROUNDS = 0.05, 2  # of the search for the least value
-PLACE_DEVIATIONS = torch.tensor([0.6] * 3 + [0.2] * 3 + [0.1])  # of turn, shift, and growth: radians, radii, logarithm
+PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # of turn, shift, and growth: radians, radii, logarithm
 PLACE = len(PLACE_DEVIATIONS)
 MARCH = TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
 
@@ -88,7 +88,7 @@ class PhotoProblem:
     pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     weights: PhotoWeights
     moves: bool  # whether the shape's place is unknown, too
-    expected: Similarity = field(default_factory=Similarity.identity)  # about which the place is thought to be
+    expected: Similarity  # about which the place is thought to be
     scale: float = 0.02  # up to which misplaced outlines count by their squares
     evaluations: int = 0
 
@@ -139,7 +139,8 @@ class PhotoProblem:
         if self.moves:
             changes = torch.cat([changes, place.change(points, gradient)], dim=1)
         slope = (place.turned(gradient) * rays.directions).sum(-1)
-        at = torch.full((len(look.distance),), -1, dtype=torch.int64).index_put((rows,), torch.arange(len(rows)))
+        at = torch.full_like(look.hit, -1, dtype=torch.int64)
+        at[rows] = torch.arange(len(rows), device=rows.device)
         return _Here(at, place.to_world(points), values, changes, slope, place.scale)
 
     def _colours(self, look: Look, here: "_Here") -> Residuals:
@@ -149,8 +150,7 @@ class PhotoProblem:
         """
         rays, views = self.pairs.T
         rows = here.at[rays]
-        values = torch.empty(len(rays), 3)
-        along = torch.empty(len(rays), 3)
+        values, along = here.values.new_empty(2, len(rays), 3)
         for view in views.unique().tolist():
             some = (views == view).nonzero()[:, 0]
             picture, points = self.pictures[view], here.points[rows[some]]
@@ -179,8 +179,9 @@ class PhotoProblem:
 
     def _prior(self, look: Look) -> Residuals:
         """The code's coordinates, and how far the place is from where it is thought to be."""
-        w, place = look.shape.w, look.shape.place.step_from(self.expected) / PLACE_DEVIATIONS
-        jacobian = torch.block_diag(torch.eye(len(w)), (1 / PLACE_DEVIATIONS).diag()[:, : PLACE * self.moves])
+        w, deviations = look.shape.w, torch.tensor(PLACE_DEVIATIONS).to(look.shape.w)
+        place = look.shape.place.step_from(self.expected) / deviations
+        jacobian = torch.block_diag(torch.eye(len(w)).to(w), (1 / deviations).diag()[:, : PLACE * self.moves])
         share = torch.cat([w.new_full((len(w),), self.weights.code / len(w)), w.new_full((PLACE,), self.weights.place)])
         return Residuals(SMALL * torch.cat([w, place]), SMALL * jacobian, 2 * share / SMALL**2)
 

@@ -79,7 +79,8 @@ class Stage:
         asked = (trace.hit & (seen.certainty >= 0)).nonzero()[:, 0]
         visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
         pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
-        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves)
+        unknown = (config.weights, config.moves, shape.place)
+        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, *unknown)
         problem.evaluations += sdf.evaluations
         return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
 
@@ -109,7 +110,7 @@ class Stage:
         the object where most other views rule it out says nothing."""
         asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
         background = torch.cat([asked[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
-        is_object = torch.cat([torch.ones(int(hit.sum())), torch.zeros(len(background))]).bool()
+        is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
         regions = Regions.of(torch.cat([asked[hit], background]), is_object)
         images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
         possible = agreed(self.photographs, [image > 0 for image in images])
