@@ -82,8 +82,8 @@ def depth_page(name: str, results: Sequence[Done], place: Place) -> str:
     axis = AXES[name]
     rows = rows_of(results, axis)
     header, cells = wide(rows, axis)
-    counts = sorted({int(str(row["n"])) for row in rows})
-    count = " to ".join(str(each) for each in dict.fromkeys((counts[0], counts[-1])))
+    counts = [int(str(row["n"])) for row in rows]
+    count = f"{counts[0]}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
     lead = (
         "Median Chamfer distance × 1000, both directions summed, 30,000 points a side, in the frame of the unit sphere;"
         f" {count} instances a cell. The shapes were not trained on; depths are Embree's, of their meshes."

@@ -79,8 +79,7 @@ class Stage:
         asked = (trace.hit & (seen.certainty >= 0)).nonzero()[:, 0]
         visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
         pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
-        unknown = (config.weights, config.moves, shape.place)
-        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, *unknown)
+        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves, shape.place)
         problem.evaluations += sdf.evaluations
         return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
 
