@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 from dataclasses import replace
+from math import isfinite
 
 import pytest
 import torch
@@ -192,6 +193,8 @@ def test_the_end_that_contradicts_the_view_least_is_the_result(decoder: Decoder,
     errors = {start: error(decoder, step.code) for start, step in ends.items()}
     assert steps[-1].start == min(errors, key=lambda start: errors[start])
     assert steps[-1].evaluations > 0, "judging asks the field, and that is counted"
+    assert isfinite(steps[-1].verdict)
+    assert steps[-1].verdict == min(step.verdict for step in steps)
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])

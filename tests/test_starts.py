@@ -45,7 +45,7 @@ def test_a_judge_may_see_the_ends_differently() -> None:
         yield from (Step(start, iteration, float(start), {}, torch.zeros(2), 1.0, 10) for iteration in (1, 2))
 
     def judge(step: Step) -> Step:
-        return replace(step, loss=-step.loss, seconds=0.5, evaluations=3)
+        return replace(step, verdict=-step.loss, seconds=0.5, evaluations=3)
 
     *_, last = best_of(starts, going, judge)
     assert (last.start, last.loss, last.seconds, last.evaluations) == (1, 1.0, 1.0, 6)

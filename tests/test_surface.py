@@ -202,8 +202,9 @@ def test_the_minimum_is_found_from_wherever_on_the_ray_one_starts(seed: int, rea
     rays = Rays(passes - 2 * directions, directions)  # the middle of a sphere is passed at a distance of 2
     sdf = primitives.sphere(0.3)
     start = torch.full((50,), 2 + off, dtype=f64)
-    found = surface.minimum(sdf, rays, start, reach=reach)
+    found, value = surface.minimum_and_value(sdf, rays, start, reach=reach)
     torch.testing.assert_close(found, torch.full((50,), 2.0, dtype=f64), rtol=0, atol=1e-4)
+    torch.testing.assert_close(value, sdf(rays.at(found)))
 
 
 def test_the_minimum_lies_within_the_bounds() -> None:

@@ -111,7 +111,6 @@ def _rounds(like: Tensor, refine: int | None) -> int:
     return (10 if like.dtype == torch.float64 else 4) if refine is None else refine
 
 
-@torch.no_grad()
 def minimum(
     sdf: SDF,
     rays: Rays,
@@ -121,7 +120,21 @@ def minimum(
     reach: float = 0.1,
     refine: int | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """The distance of the local minimum of f beside `closest`, within the bounds: 1 + 3 · refine evaluations and more.
+    """The distance of the local minimum of f beside `closest`, within the bounds."""
+    return minimum_and_value(sdf, rays, closest, bounds, reach=reach, refine=refine)[0]
+
+
+@torch.no_grad()
+def minimum_and_value(
+    sdf: SDF,
+    rays: Rays,
+    closest: Float[Tensor, "*batch"],
+    bounds: Bounds | None = None,
+    *,
+    reach: float = 0.1,
+    refine: int | None = None,
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """The distance of that minimum, and f there: 1 + 3 · refine evaluations and more.
 
     Each round looks `reach` to both sides and moves to the parabola's vertex. Where that lies within, it looks a fifth
     as far from then on; where it does not (a coarse start may have passed the minimum) it goes on downhill.
@@ -145,7 +158,7 @@ def minimum(
         best = values.argmin(0, keepdim=True)
         t[going], value[going] = candidates.gather(0, best)[0], values.gather(0, best)[0]
         width[going] = torch.where(offset.abs() > w, w, w / 5)
-    return t.reshape(closest.shape)
+    return t.reshape(closest.shape), value.reshape(closest.shape)
 
 
 def _differentiable(sdf: SDF, points: Tensor) -> bool:

@@ -112,13 +112,13 @@ def least_beside(sdf: SDF, rays: Rays, closest: Float[Tensor, "n"], reach: float
 
     A network of ReLUs is linear between kinks, and then that is its minimum, which no sample meets.
     """
-    t = surface.minimum(sdf, rays, closest, reach=reach, refine=ROUNDS)
+    t, value = surface.minimum_and_value(sdf, rays, closest, reach=reach, refine=ROUNDS)
     w = 3 * reach / 5**ROUNDS
     far_left, left, right, far_right = (sdf(rays.at(t + k * w)) for k in (-2, -1, 1, 2))
     falls, rises = (left - far_left) / w, (far_right - right) / w
     encloses = (falls < 0) & (rises > 0)
     offset = (left - right + (falls + rises) * w) / torch.where(encloses, rises - falls, 1.0)
-    return torch.where(encloses, left + falls * (offset + w), sdf(rays.at(t)))
+    return torch.where(encloses, left + falls * (offset + w), value)
 
 
 @torch.no_grad()

@@ -15,7 +15,7 @@ from distrace.fitting.solver import Residuals
 from distrace.losses import Weights
 from distrace.rays import Bounds
 from distrace.rounded import quickest
-from distrace.surface import minimum
+from distrace.surface import minimum_and_value
 from distrace.trace import TraceConfig, sphere_trace
 
 BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
@@ -76,7 +76,7 @@ class Problem:
         free[aside], close[aside] = values < ATTENTION, values < WATCHED
         lacking = ~seen.known & seen.is_object & seen.bounds.meets & (~hit | seen.touches)
         wrong = free | lacking
-        t[wrong] = _lowest(sdf, seen[wrong], t[wrong])
+        t[wrong], _ = _lowest(sdf, seen[wrong], t[wrong])
         self.evaluations += sdf.evaluations
         return Look(w, t, hit, seen.known | wrong, seen.known | close | lacking)
 
@@ -89,8 +89,7 @@ class Problem:
         t[rows], hit[rows] = self._met(sdf, self.seen[rows], t[rows] - BACK)
         rows = (look.watched & ~self.seen.known).nonzero()[:, 0]
         seen = self.seen[rows]
-        t[rows] = _lowest(sdf, seen, t[rows])
-        values = sdf(seen.rays.at(t[rows]))
+        t[rows], values = _lowest(sdf, seen, t[rows])
         hit[rows] = values <= 0
         compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
         self.evaluations += sdf.evaluations
@@ -138,5 +137,5 @@ class Problem:
         return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
 
 
-def _lowest(sdf: SDF, seen: Seen, t: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    return minimum(sdf, seen.rays, t, seen.bounds, reach=REACH, refine=ROUNDS)
+def _lowest(sdf: SDF, seen: Seen, t: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    return minimum_and_value(sdf, seen.rays, t, seen.bounds, reach=REACH, refine=ROUNDS)

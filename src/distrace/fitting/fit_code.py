@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from math import isfinite
 from typing import Any
 
 import torch
@@ -112,7 +113,7 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
         yield step
     before, after = (_judged(problem.decoder, verdict, end) for end in (best, step))
     seconds, evaluations = before.seconds + after.seconds, before.evaluations + after.evaluations
-    yield replace(step if after.loss < before.loss else best, seconds=seconds, evaluations=evaluations)
+    yield replace(min(before, after, key=lambda end: end.verdict), seconds=seconds, evaluations=evaluations)
 
 
 def _passed(steps: Iterator[Step]) -> Generator[Step, None, Step]:
@@ -172,9 +173,12 @@ def _best(
 
 
 def _judged(decoder: Decoder, verdict: Verdict, step: Step) -> Step:
-    """A step with the verdict on its shape as its loss, and what that took."""
+    """A step with the verdict on its shape, and what that took: nothing, where it has one."""
+    if isfinite(step.verdict):
+        return replace(step, seconds=0.0, evaluations=0)
     began, sdf = time.perf_counter(), Counted(quickest(decoder).field(step.code))
-    return replace(step, loss=verdict(sdf, step), seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
+    judged = replace(step, verdict=verdict(sdf, step))
+    return replace(judged, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
 
 
 def _solved(

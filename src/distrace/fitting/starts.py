@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
+from math import inf
 from typing import TypeVar
 
 from jaxtyping import Float
@@ -57,6 +58,7 @@ class Step:
     code: Float[Tensor, "length"]
     seconds: float
     evaluations: int = 0  # of the field
+    verdict: float = inf  # how much it contradicts what was seen, where a judge was asked
 
 
 def stages_of(iterations: int, count: int) -> list[tuple[int, int]]:
@@ -67,12 +69,12 @@ def stages_of(iterations: int, count: int) -> list[tuple[int, int]]:
 
 Stepped = TypeVar("Stepped", bound=Step)
 Judge = Callable[[Stepped], Stepped]
-"""From a last step to one whose loss says how good that is, with the time and the evaluations that this took."""
+"""From a last step to one with a verdict, and with the time and the evaluations that this took."""
 
 
 def unjudged(step: Stepped) -> Stepped:
     """Its own loss tells, and costs nothing."""
-    return replace(step, seconds=0.0, evaluations=0)
+    return replace(step, seconds=0.0, evaluations=0, verdict=step.loss)
 
 
 def best_of(
@@ -102,9 +104,9 @@ def best_of(
         for ends[k] in runs[start]:
             yield ends[k]
     verdicts = [judge(end) for end in ends]
-    best = min(range(len(ends)), key=lambda k: verdicts[k].loss)
+    best = min(range(len(ends)), key=lambda k: verdicts[k].verdict)
     seconds, evaluations = sum(v.seconds for v in verdicts), sum(v.evaluations for v in verdicts)
-    yield replace(ends[best], seconds=seconds, evaluations=evaluations)
+    yield replace(verdicts[best], seconds=seconds, evaluations=evaluations)
 
 
 def _mean_loss(steps: Sequence[Step]) -> float:

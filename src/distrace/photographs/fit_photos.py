@@ -169,5 +169,5 @@ def _solved(
             terms = problem.terms(found.state, found.residuals)
             seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
             loss, code = sum(terms.values()), prior.code(shape.w)
-            yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, shape.place)
+            yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, place=shape.place)
             began = time.perf_counter()
