@@ -3,18 +3,13 @@
 import torch
 from test_fit_photos import ring
 
-from distrace.data.photograph import Photograph
-from distrace.photographs.consensus import agreed
+from distrace.photographs.consensus import Consensus
 from distrace.primitives import sphere
 from distrace.render import render
 
 SIZE = 48
 CAMERAS = ring(size=SIZE)
-BLANK = torch.zeros(SIZE, SIZE, 3)
-
-
-def photographs() -> list[Photograph]:
-    return [Photograph(str(k), camera, BLANK) for k, camera in enumerate(CAMERAS)]
+CONSENSUS = Consensus.of(CAMERAS)
 
 
 def masks() -> list[torch.Tensor]:
@@ -25,7 +20,7 @@ def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept() -> None:
     likely = masks()
     likely[3] = likely[3].clone()
     likely[3][:8, :8] = True  # a neighbour of the same colour
-    shown = agreed(photographs(), likely)
+    shown = CONSENSUS.agreed(likely)
     assert not shown[3][:8, :8].any()
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
 
@@ -33,10 +28,10 @@ def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept() -> None:
 def test_what_one_view_lacks_is_kept() -> None:
     likely = masks()
     likely[3] = torch.zeros_like(likely[3])
-    shown = agreed(photographs(), likely)
+    shown = CONSENSUS.agreed(likely)
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
 
 
 def test_without_anything_likely_nothing_is_possible() -> None:
-    shown = agreed(photographs(), [torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
+    shown = CONSENSUS.agreed([torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
     assert not torch.stack(shown).any()

@@ -37,6 +37,7 @@ class PhotoConfig(Starts):
     iterations: int = 24
     starts: int = 4
     trial: int = 8
+    kept: int = 4  # all of four starts: coarse images do not tell which end will agree with the fine ones
     levels: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, 1.0, 1.0)  # of the images' size, a stage each
     compared: Comparing = Comparing()
     scale: float = 0.06  # up to which misplaced outlines count by their squares in the first stage …
@@ -67,9 +68,9 @@ def fit_photos(
     """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
-    place: that given or, if it is unknown and they contradict it less there, where the photographs tell; the one whose
-    loss falls lowest goes on. On the prior's device, wherever the photographs are. Raises `ValueError` for fewer than
-    two of them.
+    place: that given or, if it is unknown and they contradict it less there, where the photographs tell. All go to
+    their ends, and the one of the least loss is the result. On the prior's device, wherever the photographs are.
+    Raises `ValueError` for fewer than two of them.
     """
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")

@@ -111,15 +111,26 @@ def allowed(
     photographs: Sequence[Photograph], cells: int, wrong: float = WRONG, least: float = 0.0
 ) -> tuple[Float[Tensor, "places 3"], Bool[Tensor, "places"]]:
     """The middles of cells about the unit sphere, and which of them masks allow: but `wrong` of those that see it."""
-    steps = (torch.arange(cells, device=photographs[0].image.device) + 0.5) * 2 / cells - 1
-    places = torch.cartesian_prod(steps, steps, steps)
+    places = cells_about(cells, photographs[0].image.device)
     seen, left_out = torch.zeros_like(places[:, 0]), torch.zeros_like(places[:, 0])
     for each in photographs:
         inside, on_object = looked_up(each.camera, each.known_mask, places)
         seen += inside
         left_out += inside & ~on_object
-    enough = seen >= max(2.0, SEEN * len(photographs))
-    return places, enough & (left_out <= (wrong * seen).clamp_min(least)) & (places.norm(dim=-1) < 1)
+    return places, let_by(seen, left_out, len(photographs), wrong, least) & (places.norm(dim=-1) < 1)
+
+
+def cells_about(cells: int, device: torch.device) -> Float[Tensor, "places 3"]:
+    """The middles of a cube's cells about the unit sphere, as many along each axis."""
+    steps = (torch.arange(cells, device=device) + 0.5) * 2 / cells - 1
+    return torch.cartesian_prod(steps, steps, steps)
+
+
+def let_by(
+    seen: Float[Tensor, "places"], left_out: Float[Tensor, "places"], views: int, wrong: float, least: float = 0.0
+) -> Bool[Tensor, "places"]:
+    """Places that enough of the views see, of which but a share leaves them out, or but `least` of them."""
+    return (seen >= max(2.0, SEEN * views)) & (left_out <= (wrong * seen).clamp_min(least))
 
 
 def _distances(solid: Bool[Tensor, "places"]) -> SDF:

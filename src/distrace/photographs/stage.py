@@ -12,7 +12,7 @@ from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
 from distrace.fitting.prior import Prior
 from distrace.fitting.targets import drawn
-from distrace.photographs.consensus import agreed
+from distrace.photographs.consensus import Consensus
 from distrace.photographs.pairs import Colours, partners, without_light
 from distrace.photographs.regions import Regions, appearance
 from distrace.photographs.residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
@@ -51,15 +51,16 @@ class Stage:
     partners: Int[Tensor, "views count"]  # to compare each view with; -1 where there are fewer
     looks: Sequence[Float[Tensor, "height width 4"]]  # by which object and background are told apart
     meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
+    consensus: Consensus  # on what can be the object
 
     @staticmethod
     def of(photographs: Sequence[Photograph], level: float, config: Comparing) -> "Stage":
         coarse = [photograph.resized(level) for photograph in photographs]
         images = [each.image if config.same_light else without_light(each.image) for each in coarse]
         pictures = [Colours.of(image, each.camera) for image, each in zip(images, coarse, strict=True)]
-        meets = [meet_sphere(each.camera.rays()).meets.reshape(-1) for each in coarse]
-        looks = [appearance(each.image) for each in coarse]
-        return Stage(coarse, pictures, partners([each.camera for each in coarse], config.partners), looks, meets)
+        cameras, looks = [each.camera for each in coarse], [appearance(each.image) for each in coarse]
+        meets = [meet_sphere(camera.rays()).meets.reshape(-1) for camera in cameras]
+        return Stage(coarse, pictures, partners(cameras, config.partners), looks, meets, Consensus.of(cameras))
 
     @torch.no_grad()
     def problem(
@@ -112,7 +113,7 @@ class Stage:
         is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
         regions = Regions.of(torch.cat([asked[hit], background]), is_object)
         images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
-        possible = agreed(self.photographs, [image > 0 for image in images])
+        possible = self.consensus.agreed([image > 0 for image in images])
         kept = [image.masked_fill((image > 0) & ~shown, 0.0) for image, shown in zip(images, possible, strict=True)]
         sure = self._read(view, index, [image[..., None] for image in kept])[:, 0]
         sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
