@@ -19,7 +19,7 @@ from distrace.fast.tracer import fast_trace
 from distrace.field import SDF, Counted
 from distrace.rays import meet_sphere
 from distrace.render import render
-from distrace.trace import Outcome, Trace
+from distrace.trace import DYNAMIC, Outcome, Trace
 
 f64 = torch.float64
 TOLERANCE = FastConfig().tolerance
@@ -94,6 +94,51 @@ def first() -> tuple[Trace, Lattice]:
 def decoded() -> tuple[ShapeField, Trace, Lattice]:
     field = perceptron().field(torch.zeros(4, dtype=f64))
     return field, *fast_trace(field, view())
+
+
+STEEP: dict[str, SDF] = {
+    "× 3": lambda points: 3 * SHAPES["plate"](points),
+    "× 100": lambda points: 100 * SHAPES["torus"](points),
+    "saturated": lambda points: torch.tanh(6 * primitives.box(torch.tensor([0.5, 0.02, 0.4], dtype=f64))(points)),
+    "stretched": lambda points: primitives.torus(0.5, 0.12)(points * torch.tensor([1, 4, 1], dtype=f64)),
+}
+
+
+@pytest.mark.parametrize("name", STEEP)
+def test_what_is_thin_in_a_steep_field_is_seen(name: str) -> None:
+    camera = view(48)
+    buffers, rays = render(STEEP[name], camera), camera.rays()
+    samples = torch.linspace(0, 1, 4000, dtype=f64)[:, None, None]
+    inside = meet_sphere(rays)
+    along = torch.where(inside.meets, inside.near + samples * (inside.far - inside.near), 0.0)
+    true = (torch.stack([STEEP[name](rays.at(t)) for t in along]).amin(0) < 0) & inside.meets
+    assert true.sum() > 80
+    assert (buffers.mask != true).sum() <= 2, "pixels at the outline"
+
+
+def test_a_field_that_is_infinite_far_away_is_seen_where_it_is_not() -> None:
+    infinite = lambda points: torch.where(points.norm(dim=-1) > 0.9, torch.inf, BALL(points))  # noqa: E731
+    assert (render(infinite, view(32)).mask == render(BALL, view(32)).mask).all()
+    assert not render(lambda points: torch.full_like(points[..., 0], torch.inf), view(32)).mask.any()
+
+
+def test_a_solid_that_reaches_out_of_the_bounds_is_not_hit_before_them() -> None:
+    for solid in (primitives.box(torch.tensor([3.0, 0.3, 3.0])), primitives.cylinder(0.3, 2.0)):
+        buffers, marched = (render(solid, view(32), config=config) for config in (FastConfig(), DYNAMIC))
+        assert marched.mask.any()
+        assert (buffers.trace.outcome == Outcome.INSIDE).any()
+        settled = marched.trace.outcome != Outcome.EXHAUSTED
+        assert (buffers.mask == marched.mask)[settled].all()
+        assert buffers.points.norm(dim=-1).max() < 1.001
+
+
+def test_the_clearance_of_a_ray_past_two_balls_is_that_of_the_nearer() -> None:
+    balls = [primitives.sphere(0.12, torch.tensor([-0.7, 0, 0])), primitives.sphere(0.2, torch.tensor([0.6, 0.3, 0.2]))]
+    camera = Camera.orbit(30, 20, 3.0, focal_px=45.0, height=40, width=40)
+    both = render(primitives.union(*balls), camera)
+    least = torch.stack([render(ball, camera).clearance for ball in balls]).amin(0)
+    missed = both.clearance.isfinite() & ~both.mask
+    assert (both.clearance - least)[missed].abs().max() < 1e-4
 
 
 @pytest.mark.parametrize(("radius", "size"), [(0.2, 96), (0.7, 64), (0.95, 48)])

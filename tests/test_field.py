@@ -20,7 +20,7 @@ WRONG = {
     "sign": lambda p: p[..., 0] > 0,
 }
 f64 = torch.float64
-fine = TraceConfig(steps=300, tolerance=1e-9, coarse_levels=0)
+fine = TraceConfig(steps=300, step_scale=1.0, tolerance=1e-9, coarse_levels=0)
 
 
 def points(seed: int, *shape: int) -> torch.Tensor:

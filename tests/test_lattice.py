@@ -11,6 +11,7 @@ from torch.nn.functional import normalize
 from distrace import primitives
 from distrace.fast.lattice import Lattice, LatticeConfig, build
 from distrace.field import SDF, Counted
+from distrace.steepness import typical_slope
 
 f64 = torch.float64
 CONFIG, DOUBLE = LatticeConfig(), torch.empty(0, dtype=f64)
@@ -309,4 +310,12 @@ def test_the_steepness_of_a_distance_is_one() -> None:
 
 
 def test_a_field_without_a_surface_has_no_steepness() -> None:
-    assert lattice_of(FAR).measured_steepness() == 0
+    assert lattice_of(FAR).measured_steepness() is None
+    assert typical_slope(FAR, torch.empty(0, dtype=f64))[0] == 0
+
+
+@pytest.mark.parametrize("factor", [0.1, 1.0, 20.0])
+def test_a_typical_slope_is_taken_where_the_field_says_that_it_is_near(factor: float) -> None:
+    slope, evaluations = typical_slope(lambda points: factor * (points.norm(dim=-1) - 1.0), torch.empty(0), radius=2.0)
+    assert slope == pytest.approx(factor, rel=0.01)
+    assert evaluations < 1500

@@ -11,6 +11,7 @@ from distrace import primitives
 from distrace.mesh import MeshConfig, extract_mesh
 
 COARSE = MeshConfig(resolution=48)
+BALL, PLATE = primitives.sphere(0.6), primitives.box(torch.tensor([0.6, 0.05, 0.5]))
 
 
 def test_a_sphere_has_its_volume_and_area_and_is_closed() -> None:
@@ -20,6 +21,20 @@ def test_a_sphere_has_its_volume_and_area_and_is_closed() -> None:
     assert mesh.volume == pytest.approx(4 / 3 * math.pi * 0.6**3, rel=5e-3)
     assert mesh.area == pytest.approx(4 * math.pi * 0.6**2, rel=5e-3)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.6).max() < 1e-3
+
+
+@pytest.mark.parametrize("factor", [3.0, 100.0])
+def test_a_field_that_is_steeper_than_a_distance_has_the_same_mesh(factor: float) -> None:
+    mesh, steep = (extract_mesh(sdf, COARSE) for sdf in (BALL, lambda points: factor * BALL(points)))
+    assert np.abs(steep.vertices - mesh.vertices).max() < 1e-5
+    thin = extract_mesh(lambda points: torch.tanh(6 * PLATE(points)), COARSE)
+    assert thin.is_watertight
+    assert thin.area == pytest.approx(extract_mesh(PLATE, COARSE).area, rel=0.01)
+
+
+def test_a_grid_that_no_memory_holds_is_refused() -> None:
+    with pytest.raises(ValueError, match="100000000 was given"):
+        MeshConfig(100_000_000)
 
 
 def test_normals_point_out() -> None:

@@ -37,12 +37,14 @@ def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool
 
 def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> None:
     lost = placed(bumpy_balls().field(TRUE), torch.diag(torch.tensor([0.3, 0.3, 0.3, 1.0])))
-    there, again = found(views), found(views, bumpy_balls().field(TRUE), lost)
+    some = views[::2]
+    there, again = found(some), found(some, bumpy_balls().field(TRUE), lost)
     assert float(again.scale) == pytest.approx(float(there.scale), abs=0.01)
-    assert float(found(views, lost, lost).scale) > 2 * float(there.scale), "what most of them say counts"
+    assert float(found(some, lost, lost).scale) > 2 * float(there.scale), "what most of them say counts"
 
 
 def test_photographs_of_nothing_say_nothing(views: list[Photograph]) -> None:
-    blank = [replace(view, image=GREY.expand_as(view.image)) for view in views]
+    some = views[::3]
+    blank = [replace(view, image=GREY.expand_as(view.image)) for view in some]
     assert found(blank).scale == 1
-    assert found([replace(view, mask=torch.zeros(view.image.shape[:2]).bool()) for view in views]).scale == 1
+    assert found([replace(view, mask=torch.zeros(view.image.shape[:2]).bool()) for view in some]).scale == 1

@@ -157,7 +157,10 @@ class Camera:
         return replace(self, intrinsics=self.intrinsics * scale, height=size[0], width=size[1])
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
-        """The same camera with a part of its sensor."""
+        """The same camera with a part of its sensor. Raises `ValueError` for a part that it does not have."""
+        if not (0 <= top < self.height and 0 <= left < self.width and height > 0 and width > 0):
+            size = f"{self.height} × {self.width} pixels"
+            raise ValueError(f"{height} × {width} pixels from row {top} and column {left} were asked for, of {size}")
         moved = self.intrinsics.clone()
         moved[..., 0, 2] -= left
         moved[..., 1, 2] -= top

@@ -9,6 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
+import numpy as np
 import safetensors.torch
 import torch
 from jaxtyping import Float
@@ -32,13 +33,13 @@ class Model:
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor, "length"]) -> SDF:
+    def field(self, code: int | Float[Tensor | np.ndarray, "length"]) -> SDF:
         """The signed distance field of a training code, or of any code.
 
         Raises `ValueError` for a number or a length that the model has not.
         """
-        if isinstance(code, Tensor):
-            return self.decoder.field(code)
+        if isinstance(code, Tensor | np.ndarray):
+            return self.decoder.field(torch.as_tensor(code))
         if not 0 <= code < len(self.codes):
             raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])
@@ -164,6 +165,8 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
         if state[key].shape != expected[key].shape:
             given, wanted = list(state[key].shape), list(expected[key].shape)
             raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
+        if state[key].layout != torch.strided:
+            raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")
         if not state[key].isfinite().all():
             raise ValueError(f"{source}: {key} has values that are not finite; the training that wrote it has diverged")
     decoder.load_state_dict(state, assign=True)

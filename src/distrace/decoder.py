@@ -82,8 +82,9 @@ class Decoder(nn.Module):
     def field(self, code: Float[Tensor, "length"]) -> "ShapeField":
         """The signed distance field of one shape, the constant code folded into the biases of the layers it enters.
 
-        Raises `ValueError` for a code of another length.
+        In the decoder's precision, whatever the code's. Raises `ValueError` for a code of another length.
         """
+        code = torch.as_tensor(code).to(next(self.parameters()))
         if code.shape != (self.specs.code_length,):
             takes = [self.specs.code_length]
             raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
@@ -131,6 +132,11 @@ class ShapeField:
         self.evaluate = chunked(lambda points: decoder._run(layers, points), self.size)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        if points.dtype != self.layers[0][0].dtype:
+            raise ValueError(
+                f"points in {points.dtype} were given to a decoder in {self.layers[0][0].dtype}; give a camera in that"
+                " precision, or change the decoder's by `.double()` or `.float()`"
+            )
         return self.evaluate(points)
 
     @torch.no_grad()

@@ -31,11 +31,17 @@ def value_and_gradient(
     """The field's value and its gradient ∇f at each point, from one evaluation.
 
     Where grad mode is on both are differentiable; without `second_order` the gradient is a constant, at half the cost.
+    Raises `ValueError` for a field that autograd does not see through.
     """
     keep_graph = torch.is_grad_enabled()
     with torch.enable_grad():
         points = points if points.requires_grad else points.detach().requires_grad_()
         value = sdf(points)
+        if not value.requires_grad:
+            raise ValueError(
+                "the field's values do not know what points they came from, so they have no gradient; is it under"
+                " torch.no_grad, or does it detach its points?"
+            )
         twice = keep_graph and second_order
         (gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=keep_graph, create_graph=twice)
     return value if keep_graph else value.detach(), gradient

@@ -1,6 +1,6 @@
 """The surface of a field as triangles."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,8 +10,12 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from distrace.field import SDF, asked, chunked, narrowed
+from distrace.steepness import steep, typical_slope
 
 AT_ONCE = 1 << 16  # points, of a field that does not limit them itself
+MOST = 2048  # cells along an axis: 32 GiB of values
+ROUNDS = 4  # at most, in which a field that is steeper than told is meshed again, …
+STEEPER = 1.25  # … for as much more than was found
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
 
 
@@ -21,12 +25,12 @@ class MeshConfig:
 
     resolution: int = 256
     radius: float = 1.0  # beyond, where decoders were never trained and rays are not marched, is outside
-    steepest: float = 1.5  # a bound on |∇f|: a cell farther from zero than this over half its diagonal is passed over
+    steepest: float = 1.5  # |∇f|, unless more is found: cells farther from zero over half a diagonal are left out
     device: torch.device = torch.device("cpu")
 
     def __post_init__(self) -> None:
-        if self.resolution < 8 or self.resolution % 2**LEVELS:
-            raise ValueError(f"a resolution of {self.resolution} was given; it must be a multiple of 8")
+        if not 8 <= self.resolution <= MOST or self.resolution % 2**LEVELS:
+            raise ValueError(f"a resolution of {self.resolution} was given; it must be a multiple of 8, up to {MOST}")
 
 
 @torch.no_grad()
@@ -35,19 +39,47 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
 
     Normals point out. Raises `ValueError` where the field has no zero in the cube.
     """
-    width = 2 * config.radius / config.resolution
-    cells, near = _cells_at_surface(sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE), config)
-    corners = _corners(cells)
-    points = corners.float() * width - config.radius
-    found = near(points)
-    if not ((found < 0).any() and (found > 0).any()):
-        raise ValueError(f"the field has no zero within {config.radius} of the origin: there is no surface to extract")
-    values = _in_ball(found, points, config.radius).cpu().numpy()
-    grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
-    grid[tuple(corners.cpu().numpy().T)] = values
-    known = np.isfinite(grid)
+    sdf = sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE)
+    slope, _ = typical_slope(sdf, torch.empty(0, device=config.device), config.radius)
+    if slope > config.steepest:
+        config = replace(config, steepest=STEEPER * slope)
+    grid = _values(sdf, config)
+    for _ in range(ROUNDS):
+        found = _steepness(grid, config)
+        if found <= config.steepest:
+            break
+        config = replace(config, steepest=STEEPER * found)
+        grid = _values(sdf, config)
+    width, known = 2 * config.radius / config.resolution, np.isfinite(grid)
     vertices, faces, _, _ = marching_cubes(np.where(known, grid, 1.0), 0.0, mask=_whole_cells(known))
     return trimesh.Trimesh(vertices * width - config.radius, faces, process=False)
+
+
+def _values(sdf: SDF, config: MeshConfig) -> np.ndarray:
+    """At the corners of the cells that can hold the surface; NaN elsewhere."""
+    cells, near = _cells_at_surface(sdf, config)
+    corners = _corners(cells)
+    points = corners.float() * (2 * config.radius / config.resolution) - config.radius
+    found = near(points)
+    if not ((found < 0).any() and (found > 0).any()):
+        raise ValueError(
+            f"the field has no zero within {config.radius} of the origin: there is no surface to extract; if"
+            f" there is, the field is steeper than {config.steepest:.3g} per length: say how steep by `steepest`"
+        )
+    grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
+    grid[tuple(corners.cpu().numpy().T)] = _in_ball(found, points, config).cpu().numpy()
+    return grid
+
+
+def _steepness(grid: np.ndarray, config: MeshConfig) -> float:
+    """What 99 of 100 differences of the field across its zero stay below, per length."""
+    slopes = []
+    for axis in range(3):
+        first, second = (np.moveaxis(grid, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        crossed = (first < 0) != (second < 0)
+        apart = np.abs(second[crossed] - first[crossed])
+        slopes.append(torch.from_numpy(apart[np.isfinite(apart)]))
+    return steep(torch.cat(slopes)) / (2 * config.radius / config.resolution)
 
 
 def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"], SDF]:
@@ -61,14 +93,14 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
         width = 2 * config.radius / config.resolution * 2**level
         centres = (cells + 0.5) * width - config.radius
         values, field = narrowed(sdf, centres) if level == 1 else (asked(sdf, centres), sdf)
-        near = _in_ball(values, centres, config.radius).abs() <= config.steepest * width * 3**0.5 / 2
+        near = _in_ball(values, centres, config).abs() <= config.steepest * width * 3**0.5 / 2
         cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
     return cells, field
 
 
-def _in_ball(values: Float[Tensor, "n"], points: Float[Tensor, "n 3"], radius: float) -> Float[Tensor, "n"]:
-    """What is common to the shape and the ball."""
-    return values.maximum(points.norm(dim=1) - radius)
+def _in_ball(values: Float[Tensor, "n"], points: Float[Tensor, "n 3"], config: MeshConfig) -> Float[Tensor, "n"]:
+    """What is common to the shape and the ball, both as steep."""
+    return values.maximum(config.steepest * (points.norm(dim=1) - config.radius))
 
 
 def _corners(cells: Int[Tensor, "n 3"]) -> Int[Tensor, "m 3"]:

@@ -1,5 +1,6 @@
 """The whole way from a field and a camera to images, on one page."""
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
@@ -88,14 +89,25 @@ class Buffers:
 
     @_kept
     def clearance(self) -> Float[Tensor, "*batch"]:
-        """The least |sdf| on each ray, signed; `inf` where a ray never meets the bounds. Costs evaluations."""
+        """The least sdf on each ray that misses, and sdf at hits; `inf` where a ray never meets the bounds.
+
+        Costs evaluations. Without the fast tracer's lattice it is the minimum beside the march's sample.
+        """
         met, hit = torch.isfinite(self.trace.closest), self.trace.hit
         least = torch.full_like(self.trace.closest, torch.inf)
         least = least.masked_scatter(hit, self.near(self.rays[hit].at(self.trace.distance[hit])))
         missed = met & ~hit
         rays, closest = self.rays[missed], self.trace.closest[missed]
         bounds = meet_sphere(rays.detach(), self.radius)
-        return least.masked_scatter(missed, surface.clearance(self.sdf, rays, closest, bounds))
+        return least.masked_scatter(missed, surface.clearance(self.sdf, rays, closest, bounds, self._other(missed)))
+
+    def _other(self, missed: Bool[Tensor, "*batch"]) -> Float[Tensor, "n"] | None:
+        """Where else than at the trace's samples the lattice has the field least."""
+        if self.lattice is None:
+            return None
+        rays, closest = self.rays.detach()[missed], self.trace.closest[missed] / self.radius
+        unit = Rays(rays.origins / self.radius, rays.directions)
+        return self.radius * self.lattice.lowest(unit, meet_sphere(unit), closest)
 
 
 def render(
@@ -109,18 +121,20 @@ def render(
 ) -> Buffers:
     """Renders a field inside a sphere of `radius` around the origin, as a camera sees it.
 
-    The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera. The fast
-    tracer takes over what a rendering before has learnt: `lattice`, of the same field, and `last`, the trace of nearly
-    the same field by nearly the same camera. Give a radius about as large as what there is to see, for the fast
-    tracer's accuracy is a part of it. Raises `ValueError` for a radius that is not positive, and for a field that does
-    not give one distance for each point.
+    The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera; those of
+    these gradients, by `create_graph`, are not exact. The fast tracer takes over what a rendering before has learnt:
+    `lattice`, of the same field, and `last`, the trace of nearly the same field by nearly the same camera. Give a radius
+    about as large as what there is to see, for a configuration's lengths are parts of it, but tolerances that are told
+    for each ray. Raises `ValueError` for a radius that is not positive, and for a field that does not give one distance
+    for each point.
     """
-    if not radius > 0:
+    if not 0 < radius < math.inf:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")
     rays = camera.rays()
     if isinstance(config, FastConfig):
         trace, lattice = fast_trace(sdf, camera, radius, config, lattice, last)
         return Buffers(sdf, rays, camera.cosines(), trace, radius, lattice)
+    config = config.within(radius)
     start, setup = pyramid.starts(sdf, camera, radius, config) if config.coarse_levels else (None, 0)
     steps = max(config.steps - config.coarse_levels * config.coarse_steps, 1)
     trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), replace(config, steps=steps), start)
@@ -147,5 +161,5 @@ def render_rays(
 ) -> Buffers:
     """The same for some pixel positions (x, y) alone: what a loss on sparse observations needs. No coarse levels."""
     rays = camera.rays(pixels)
-    trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), config)
+    trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), config.within(radius))
     return Buffers(sdf, rays, camera.cosines(pixels), trace, radius)

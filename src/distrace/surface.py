@@ -23,7 +23,8 @@ def attach(
 
     The implicit function theorem on f(o + t v; θ) = 0 (Niemeyer et al., *DVR*, CVPR 2020; Yariv et al., *IDR*, NeurIPS
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
-    surface tangentially (|∇f · v| < `least_slope`) there is no derivative, and none is given.
+    surface tangentially (|∇f · v| < `least_slope`) there is no derivative, and none is given. It is
+    the first alone: what autograd says of a second is wrong.
     """
     distance, fixed = distance.detach(), rays.detach()
     points = fixed.at(distance)
@@ -68,6 +69,7 @@ def clearance(
     rays: Rays,
     closest: Float[Tensor, "*batch"],
     bounds: Bounds | None = None,
+    other: Float[Tensor, "*batch"] | None = None,
     *,
     reach: float = 0.1,
     refine: int | None = None,
@@ -75,9 +77,17 @@ def clearance(
     """The least value of f on rays that miss, differentiable in the field and the ray; `closest` is the trace's sample.
 
     The march samples a ray no closer than its steps, so its least sample is not the minimum, and the gradient at it
-    would lie.
+    would lie. A ray past several parts has as many minima: where an `other` may be as low it is looked for, too. At an
+    end of the bounds the derivative is that of the value at a fixed distance.
     """
-    lowest = minimum(sdf, rays.detach(), closest.detach(), bounds, reach=reach, refine=refine)
+    fixed = rays.detach()
+    lowest, value = minimum_and_value(sdf, fixed, closest.detach(), bounds, reach=reach, refine=refine)
+    if other is not None:
+        with torch.no_grad():
+            near = (sdf(fixed.at(other)) < value + reach / 2).nonzero(as_tuple=True)
+        some = None if bounds is None else Bounds(bounds.near[near], bounds.far[near])
+        there, found = minimum_and_value(sdf, fixed[near], other[near], some, reach=reach, refine=refine)
+        lowest[near] = torch.where(found < value[near], there, lowest[near])
     return least(sdf, rays, lowest, reach=reach, refine=refine)
 
 

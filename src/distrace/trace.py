@@ -36,8 +36,17 @@ class TraceConfig:
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
 
     def __post_init__(self) -> None:
-        if self.steps < 1 or self.step_scale <= 0 or self.step_limit <= 0 or self.coarse_levels < 0:
-            raise ValueError(f"{self} cannot march: steps, step_scale and step_limit must be positive, and levels ≥ 0")
+        lengths = (self.step_scale, self.step_limit, *((self.tolerance,) if isinstance(self.tolerance, float) else ()))
+        if self.steps < 1 or not all(length > 0 for length in lengths) or self.coarse_levels < 0:
+            raise ValueError(
+                f"{self} cannot march: steps, step_scale, step_limit and tolerance must be positive, and levels ≥ 0"
+            )
+
+    def within(self, radius: float) -> "TraceConfig":
+        """The same march in a sphere of another radius than 1."""
+        tolerance = self.tolerance if isinstance(self.tolerance, Tensor) else self.tolerance * radius
+        limit, least = self.step_limit * radius, self.least_step * radius
+        return replace(self, step_limit=limit, least_step=least, tolerance=tolerance)
 
 
 PARALLEL = TraceConfig(steps=50, step_scale=1.0, compaction=False, coarse_levels=0)  # 50: as published

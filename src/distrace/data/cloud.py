@@ -51,7 +51,7 @@ def load_cloud(path: Path) -> Cloud:
     """
     with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere"):
         loaded: Any = trimesh.load(path, process=False)
-        points = torch.tensor(np.asarray(loaded.vertices), dtype=torch.float32)
+        points = torch.tensor(np.asarray(getattr(loaded, "vertices", np.empty((0, 3)))), dtype=torch.float32)
         normals = _normals(loaded)
     with about(path):
         if not len(points) or not torch.isfinite(points).all():

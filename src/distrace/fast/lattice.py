@@ -9,7 +9,11 @@ from torch.nn import functional as F
 
 from distrace.field import SDF, asked, narrowed
 from distrace.rays import Bounds, Rays, meet_box
+from distrace.steepness import steep
 
+SAMPLES = 32  # along a ray: about a smallest cell apart
+TELLING = 30  # differences, at least, that say how steep a field is
+FAR = 4.0  # no zero in the unit sphere is farther from a corner: what the field says beyond, infinity too, is the same
 INNER = 0.25  # of a cell's width: cells deeper inside than this are not halved, for rays meet the surface before them
 
 
@@ -67,15 +71,26 @@ class Lattice:
         found = F.grid_sample(both, points.flip(-1)[None, None, None], padding_mode="border", align_corners=True)
         return found[0, 0, 0, 0], found[0, 1, 0, 0]
 
-    def measured_steepness(self) -> float:
-        """What 99 of 100 differences along the axes stay below, per length, within two cells of the surface."""
+    @torch.no_grad()
+    def lowest(self, rays: Rays, bounds: Bounds, but: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """Where along rays the value is least, to a cell, farther than two cells from some distances."""
+        apart, at, least = (bounds.far - bounds.near) / SAMPLES, but, torch.full_like(but, torch.inf)
+        for k in range(SAMPLES):
+            t = bounds.near + (k + 0.5) * apart
+            value = self(rays.at(t))[0].masked_fill((t - but).abs() < 2 * self.cell, torch.inf)
+            at, least = torch.where(value < least, t, at), value.minimum(least)
+        return at
+
+    def measured_steepness(self) -> float | None:
+        """What 99 of 100 differences along the axes stay below, per length, within two cells of the surface; None where
+        there are too few of them to tell."""
         near = self.values.abs() < 2 * self.cell
         slopes = []
         for axis in range(3):
             (first, second), apart = (near.narrow(axis, k, len(near) - 1) for k in (0, 1)), self.values.diff(dim=axis)
             slopes.append(apart[first & second].abs() / self.cell)
         found = torch.cat(slopes)
-        return float(found.kthvalue(max(1, int(0.99 * len(found)))).values) if len(found) else 0.0
+        return steep(found) if len(found) >= TELLING else None
 
     @torch.no_grad()
     def slope(self, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -94,7 +109,8 @@ def build(sdf: SDF, config: LatticeConfig = LatticeConfig(), like: Tensor = torc
     count = config.cells
     points = _corners(count, like)
     wanted = points.norm(dim=-1) <= 1 + 1 / count
-    values = _spread(torch.full_like(points[..., 0], torch.nan).masked_scatter(wanted, asked(sdf, points[wanted])))
+    known = asked(sdf, points[wanted]).clamp(-FAR, FAR)
+    values = _spread(torch.full_like(points[..., 0], torch.nan).masked_scatter(wanted, known))
     slack = torch.full_like(values, config.steepest * 3**0.5 / count)
     evaluations = int(wanted.sum())
     near = sdf
@@ -104,6 +120,7 @@ def build(sdf: SDF, config: LatticeConfig = LatticeConfig(), like: Tensor = torc
         wanted = _halved(values, slack, 2 / count) & (points.norm(dim=-1) <= 1 + 2 / count)
         values, slack = _finer(values), _finer(slack)
         fresh, near = narrowed(sdf, points[wanted]) if level == config.levels - 1 else (sdf(points[wanted]), sdf)
+        fresh = fresh.clamp(-FAR, FAR)
         surplus = torch.zeros_like(values).masked_scatter(wanted, (fresh - values[wanted]).abs())
         around = _pooled(surplus, 5) / 2
         slack = torch.where(_pooled(wanted.to(values), 3) > 0, around, slack)
@@ -139,7 +156,7 @@ def _pooled(image: Tensor, width: int) -> Tensor:
 def _spread(values: Tensor) -> Tensor:
     """Corners far outside of the sphere take the greatest value beside them."""
     while values.isnan().any():
-        beside = _pooled(values.nan_to_num(-torch.inf, posinf=torch.inf), 3)
+        beside = _pooled(values.nan_to_num(-torch.inf), 3)
         if not torch.isfinite(beside).any():
             return torch.zeros_like(values)  # a field of nothing but NaN: the surface may be anywhere
         values = torch.where(values.isnan() & torch.isfinite(beside), beside, values)

@@ -18,8 +18,10 @@ from distrace.fast.lattice import Lattice, build
 from distrace.fast.picture import FastConfig, Picture
 from distrace.field import SDF, narrowed
 from distrace.rays import meet_sphere
+from distrace.steepness import typical_slope
 from distrace.trace import Trace, sphere_trace
 
+ROUNDS = 4  # at most, in which a field's steepness is found
 TILE = 1024  # pixels along each side of what is traced at once: a bound on memory
 
 
@@ -60,13 +62,26 @@ def near_surface(sdf: SDF, lattice: Lattice | None) -> SDF:
 def prepared(sdf: SDF, like: Tensor, radius: float = 1.0, config: FastConfig = FastConfig()) -> tuple[Lattice, int]:
     """A lattice of the field; where that turns out to be too steep, one of the field divided by its steepness.
 
-    And how many evaluations both took."""
-    lattice = build(_unit(sdf, radius, 1.0), config.lattice, like)
-    evaluations, steepness = lattice.evaluations, lattice.measured_steepness()
-    if steepness > config.lattice.steepest:
+    And how many evaluations all took. What is thin in a steep field shows only in a lattice of the divided one, and so
+    does how steep it is there: that is found in rounds.
+    """
+    steepness, lattice = 1.0, build(_unit(sdf, radius, 1.0), config.lattice, like)
+    evaluations = lattice.evaluations
+    for _ in range(ROUNDS):
+        found, asked = _steepness(lattice, like)
+        evaluations += asked
+        if found <= config.lattice.steepest:
+            break
+        steepness *= found
         lattice = build(_unit(sdf, radius, steepness), config.lattice, like)
-        lattice, evaluations = replace(lattice, steepness=steepness), evaluations + lattice.evaluations
-    return replace(lattice, radius=radius), evaluations
+        evaluations += lattice.evaluations
+    return replace(lattice, radius=radius, steepness=steepness), evaluations
+
+
+def _steepness(lattice: Lattice, like: Tensor) -> tuple[float, int]:
+    """Of the lattice's field, by its corners or else by new points; and how many these are."""
+    found = lattice.measured_steepness()
+    return typical_slope(lattice.field, like) if found is None else (found, 0)
 
 
 def _unit(sdf: SDF, radius: float, steepness: float) -> SDF:
@@ -118,5 +133,6 @@ def _traced(sdf: SDF, camera: Camera, config: FastConfig, lattice: Lattice, last
     picture.march_left()
     outlines.follow(picture)
     picture.check_bends()
+    picture.check_bounds()
     picture.march_left()
     return picture.trace()

@@ -32,16 +32,16 @@ ASKED = 8  # of them, of which place is the likelier
 
 @dataclass(frozen=True)
 class PhotoConfig(Starts):
-    """Stages of a pyramid; each start is tried on the first ones."""
+    """Stages of a pyramid; each start is tried up to the finest: coarse images do not tell which will agree with it."""
 
-    iterations: int = 24
+    iterations: int = 48
     starts: int = 4
-    trial: int = 8
-    kept: int = 4  # all of four starts: coarse images do not tell which end will agree with the fine ones
-    levels: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, 1.0, 1.0)  # of the images' size, a stage each
+    trial: int = 24
+    levels: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, *8 * (1.0,))  # of the images' size, a stage each: new rays
     compared: Comparing = Comparing()
     scale: float = 0.06  # up to which misplaced outlines count by their squares in the first stage …
-    narrowing: float = 0.6  # … and × this from one to the next
+    narrowing: float = 0.6  # … and × this from one to the next, …
+    narrowest: float = 0.005  # … but no narrower
     damping: float = 0.1
 
     def __post_init__(self) -> None:
@@ -68,8 +68,8 @@ def fit_photos(
     """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
-    place: that given or, if it is unknown and they contradict it less there, where the photographs tell. All go to
-    their ends, and the one of the least loss is the result. On the prior's device, wherever the photographs are.
+    place: that given or, if it is unknown and they contradict it less there, where the photographs tell. The one
+    whose loss is the least on the finest images goes on. On the prior's device, wherever the photographs are.
     Raises `ValueError` for fewer than two of them.
     """
     if len(photographs) < 2:
@@ -163,7 +163,7 @@ def _solved(
         stage = stages[number]
         problem, look = stage.problem(decoder, prior, shape, config.compared, random)
         problem.expected = expected
-        problem.scale, evaluations = config.scale * config.narrowing**number, 0
+        problem.scale, evaluations = max(config.scale * config.narrowing**number, config.narrowest), 0
         solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
         for found in minimise(problem.residuals, look, problem.moved, solver):
             shape, damping, done = found.state.shape, found.damping, done + 1
