@@ -123,10 +123,10 @@ def render(
 
     The gradients of depth, normal and clearance reach whatever requires grad in the field and the camera; those of
     these gradients, by `create_graph`, are not exact. The fast tracer takes over what a rendering before has learnt:
-    `lattice`, of the same field, and `last`, the trace of nearly the same field by nearly the same camera. Give a radius
-    about as large as what there is to see, for a configuration's lengths are parts of it, but tolerances that are told
-    for each ray. Raises `ValueError` for a radius that is not positive, and for a field that does not give one distance
-    for each point.
+    `lattice`, of the same field, and `last`, the trace of nearly the same field by nearly the same camera. Give a
+    radius about as large as what there is to see, for a configuration's lengths are parts of it, but tolerances that
+    are told for each ray. Raises `ValueError` for a radius that is not positive, and for a field that does not give one
+    distance for each point.
     """
     if not 0 < radius < math.inf:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")

@@ -94,6 +94,10 @@ class Train:
             if min(layers, width) < 1:
                 raise ValueError(f"--layers {layers} --width {width} were given; a network has at least one of each")
             return NetworkSpecs((width,) * layers, code_length, (layers // 2,), norm_layers=tuple(range(layers)))
+        said = _said(self, *DEEPSDF)
+        if said:
+            sizes = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in said.items())
+            raise ValueError(f"{sizes} was given beside --begin-with {known.name}, whose size the network takes")
         specs = known.decoder.specs
         if specs.norm_layers and not specs.weight_norm:
             raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")

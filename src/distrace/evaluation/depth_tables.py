@@ -39,6 +39,7 @@ def rows_of(results: Sequence[Done], axis: str) -> list[dict[str, object]]:
         {
             "class": category,
             "method": method,
+            "density": some[0].trial.density,
             axis: step,
             "chamfer_median": median(each.chamfer for each in some),
             "chamfer_mean": sum(each.chamfer for each in some) / len(some),
