@@ -19,7 +19,7 @@ from distrace.fast.tracer import fast_trace
 from distrace.field import SDF, Counted
 from distrace.rays import meet_sphere
 from distrace.render import render
-from distrace.trace import DYNAMIC, Outcome, Trace
+from distrace.trace import Outcome, Trace
 
 f64 = torch.float64
 TOLERANCE = FastConfig().tolerance
@@ -120,16 +120,6 @@ def test_a_field_that_is_infinite_far_away_is_seen_where_it_is_not() -> None:
     infinite = lambda points: torch.where(points.norm(dim=-1) > 0.9, torch.inf, BALL(points))  # noqa: E731
     assert (render(infinite, view(32)).mask == render(BALL, view(32)).mask).all()
     assert not render(lambda points: torch.full_like(points[..., 0], torch.inf), view(32)).mask.any()
-
-
-def test_a_solid_that_reaches_out_of_the_bounds_is_not_hit_before_them() -> None:
-    for solid in (primitives.box(torch.tensor([3.0, 0.3, 3.0])), primitives.cylinder(0.3, 2.0)):
-        buffers, marched = (render(solid, view(32), config=config) for config in (FastConfig(), DYNAMIC))
-        assert marched.mask.any()
-        assert (buffers.trace.outcome == Outcome.INSIDE).any()
-        settled = marched.trace.outcome != Outcome.EXHAUSTED
-        assert (buffers.mask == marched.mask)[settled].all()
-        assert buffers.points.norm(dim=-1).max() < 1.001
 
 
 def test_the_clearance_of_a_ray_past_two_balls_is_that_of_the_nearer() -> None:

@@ -114,7 +114,7 @@ def test_the_shape_of_another_code_is_found_in_a_few_steps(decoder: Decoder, vie
     assert len(steps) <= CONFIG.total
     assert set(steps[-1].terms) - {"outline"} == {"depth", "missing", "extra", "code"}
     assert steps[-1].loss == pytest.approx(sum(steps[-1].terms.values()))
-    assert steps[-1].loss < 0.1 * steps[0].loss
+    assert steps[-1].loss - steps[-1].terms.get("outline", 0.0) < 0.1 * steps[0].loss, "the first has no outline term"
     assert all(step.evaluations > 0 and step.seconds > 0 for step in steps)
 
 

@@ -13,7 +13,6 @@ from distrace.field import SDF
 from distrace.rays import Bounds, Rays
 from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
 
-AT_BOUNDS = 1e-3  # hits as little before or behind the bounds are on them
 NEARBY = 0.01  # how far a hit is held against samples behind it, and how far before an odd one a march starts
 SECOND_DOUBT = 0.29  # relative, of a slope that was used before
 BENT = 3e-4  # distances that are off from both neighbours by more, and were reached from afar, are looked at again
@@ -122,11 +121,6 @@ class Picture:
         self.outcome[pixels] = trace.outcome.to(torch.int8)
         self.evaluations[pixels] += trace.evaluations.to(torch.int32)
         return trace
-
-    def check_bounds(self) -> None:
-        """Marches the rays anew that hit what is not within their bounds: a solid that they begin in, for one."""
-        beyond = self.hit & ((self.distance < self.near - AT_BOUNDS) | (self.distance > self.far + AT_BOUNDS))
-        self.distance[beyond], self.start[beyond] = torch.inf, self.near[beyond]
 
     def check_bends(self) -> None:
         """Looks again at hits that lie off the surface of their neighbours."""

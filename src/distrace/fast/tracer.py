@@ -133,6 +133,5 @@ def _traced(sdf: SDF, camera: Camera, config: FastConfig, lattice: Lattice, last
     picture.march_left()
     outlines.follow(picture)
     picture.check_bends()
-    picture.check_bounds()
     picture.march_left()
     return picture.trace()
