@@ -14,7 +14,8 @@ from distrace.steepness import steep, typical_slope
 
 AT_ONCE = 1 << 16  # points, of a field that does not limit them itself
 MOST = 2048  # cells along an axis: 32 GiB of values
-ROUNDS = 4  # at most, in which a field that is steeper than told is meshed again, …
+ROUNDS = 4  # at most, in which a field that is steeper than told is meshed again: …
+ALMOST = 1.01  # × as steep as told is not steeper …
 STEEPER = 1.25  # … for as much more than was found
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
 
@@ -46,7 +47,7 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
     grid = _values(sdf, config)
     for _ in range(ROUNDS):
         found = _steepness(grid, config)
-        if found <= config.steepest:
+        if found <= ALMOST * config.steepest:
             break
         config = replace(config, steepest=STEEPER * found)
         grid = _values(sdf, config)

@@ -65,8 +65,8 @@ class _Cells:
         shown.view(-1)[self.pixel[within]] = 1.0
         if not within.any():
             return shown.bool()
-        half = math.sqrt(3) / CELLS * float(camera.intrinsics[0, 0] / self.depth[within].min())  # a diagonal, in pixels
-        reach = min(math.ceil(half), max(camera.height, camera.width))
+        cell = math.sqrt(3) / CELLS * float(camera.intrinsics[0, 0] / self.depth[within].min())  # half a diagonal
+        reach = min(math.ceil(cell), max(camera.height, camera.width))
         return _spread(_spread(shown, reach).T, reach).T > 0
 
 
