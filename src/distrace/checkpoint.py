@@ -39,7 +39,7 @@ class Model:
         Raises `ValueError` for a number or a length that the model has not.
         """
         if isinstance(code, Tensor | np.ndarray):
-            return self.decoder.field(torch.as_tensor(code))
+            return self.decoder.field(code)
         if not 0 <= code < len(self.codes):
             raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
@@ -79,7 +80,7 @@ class Decoder(nn.Module):
             layers = self._folded(code)
         return self._run(layers, points)
 
-    def field(self, code: Float[Tensor, "length"]) -> "ShapeField":
+    def field(self, code: Float[Tensor | np.ndarray, "length"]) -> "ShapeField":
         """The signed distance field of one shape, the constant code folded into the biases of the layers it enters.
 
         In the decoder's precision, whatever the code's. Raises `ValueError` for a code of another length.

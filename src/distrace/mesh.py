@@ -33,6 +33,11 @@ class MeshConfig:
         if not 8 <= self.resolution <= MOST or self.resolution % 2**LEVELS:
             raise ValueError(f"a resolution of {self.resolution} was given; it must be a multiple of 8, up to {MOST}")
 
+    @property
+    def width(self) -> float:
+        """Of the finest cells."""
+        return 2 * self.radius / self.resolution
+
 
 @torch.no_grad()
 def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh:
@@ -51,16 +56,16 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
             break
         config = replace(config, steepest=STEEPER * found)
         grid = _values(sdf, config)
-    width, known = 2 * config.radius / config.resolution, np.isfinite(grid)
+    known = np.isfinite(grid)
     vertices, faces, _, _ = marching_cubes(np.where(known, grid, 1.0), 0.0, mask=_whole_cells(known))
-    return trimesh.Trimesh(vertices * width - config.radius, faces, process=False)
+    return trimesh.Trimesh(vertices * config.width - config.radius, faces, process=False)
 
 
 def _values(sdf: SDF, config: MeshConfig) -> np.ndarray:
     """At the corners of the cells that can hold the surface; NaN elsewhere."""
     cells, near = _cells_at_surface(sdf, config)
     corners = _corners(cells)
-    points = corners.float() * (2 * config.radius / config.resolution) - config.radius
+    points = corners.float() * config.width - config.radius
     found = near(points)
     if not ((found < 0).any() and (found > 0).any()):
         raise ValueError(
@@ -80,7 +85,7 @@ def _steepness(grid: np.ndarray, config: MeshConfig) -> float:
         crossed = (first < 0) != (second < 0)
         apart = np.abs(second[crossed] - first[crossed])
         slopes.append(torch.from_numpy(apart[np.isfinite(apart)]))
-    return steep(torch.cat(slopes)) / (2 * config.radius / config.resolution)
+    return steep(torch.cat(slopes)) / config.width
 
 
 def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"], SDF]:
@@ -91,7 +96,7 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
     coarse = torch.arange(config.resolution >> LEVELS, device=config.device)
     cells, halves = torch.cartesian_prod(coarse, coarse, coarse), _offsets(config.device)
     for level in range(LEVELS, 0, -1):
-        width = 2 * config.radius / config.resolution * 2**level
+        width = config.width * 2**level
         centres = (cells + 0.5) * width - config.radius
         values, field = narrowed(sdf, centres) if level == 1 else (asked(sdf, centres), sdf)
         near = _in_ball(values, centres, config).abs() <= config.steepest * width * 3**0.5 / 2

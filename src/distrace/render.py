@@ -99,15 +99,8 @@ class Buffers:
         missed = met & ~hit
         rays, closest = self.rays[missed], self.trace.closest[missed]
         bounds = meet_sphere(rays.detach(), self.radius)
-        return least.masked_scatter(missed, surface.clearance(self.sdf, rays, closest, bounds, self._other(missed)))
-
-    def _other(self, missed: Bool[Tensor, "*batch"]) -> Float[Tensor, "n"] | None:
-        """Where else than at the trace's samples the lattice has the field least."""
-        if self.lattice is None:
-            return None
-        rays, closest = self.rays.detach()[missed], self.trace.closest[missed] / self.radius
-        unit = Rays(rays.origins / self.radius, rays.directions)
-        return self.radius * self.lattice.lowest(unit, meet_sphere(unit), closest)
+        other = self.lattice and self.lattice.lowest(rays.detach(), bounds, closest)
+        return least.masked_scatter(missed, surface.clearance(self.sdf, rays, closest, bounds, other))
 
 
 def render(
@@ -125,11 +118,11 @@ def render(
     these gradients, by `create_graph`, are not exact. The fast tracer takes over what a rendering before has learnt:
     `lattice`, of the same field, and `last`, the trace of nearly the same field by nearly the same camera. Give a
     radius about as large as what there is to see, for a configuration's lengths are parts of it, but tolerances that
-    are told for each ray. Raises `ValueError` for a radius that is not positive, and for a field that does not give one
-    distance for each point.
+    are told for each ray. Raises `ValueError` for a radius that is not positive and finite, and for a field that does
+    not give one distance for each point.
     """
     if not 0 < radius < math.inf:
-        raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive radius")
+        raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive, finite radius")
     rays = camera.rays()
     if isinstance(config, FastConfig):
         trace, lattice = fast_trace(sdf, camera, radius, config, lattice, last)

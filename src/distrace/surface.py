@@ -23,8 +23,8 @@ def attach(
 
     The implicit function theorem on f(o + t v; θ) = 0 (Niemeyer et al., *DVR*, CVPR 2020; Yariv et al., *IDR*, NeurIPS
     2020): one evaluation of the gradient per hit serves shape, pose and focal length alike. Where a ray touches the
-    surface tangentially (|∇f · v| < `least_slope`) there is no derivative, and none is given. It is
-    the first alone: what autograd says of a second is wrong.
+    surface tangentially (|∇f · v| < `least_slope`) there is no derivative, and none is given.
+    It is the first alone: what autograd says of a second is wrong.
     """
     distance, fixed = distance.detach(), rays.detach()
     points = fixed.at(distance)

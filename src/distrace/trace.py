@@ -36,7 +36,9 @@ class TraceConfig:
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
 
     def __post_init__(self) -> None:
-        lengths = (self.step_scale, self.step_limit, *((self.tolerance,) if isinstance(self.tolerance, float) else ()))
+        lengths = [self.step_scale, self.step_limit]
+        if isinstance(self.tolerance, float):
+            lengths.append(self.tolerance)
         if self.steps < 1 or not all(length > 0 for length in lengths) or self.coarse_levels < 0:
             raise ValueError(
                 f"{self} cannot march: steps, step_scale, step_limit and tolerance must be positive, and levels ≥ 0"

@@ -88,13 +88,13 @@ class Train:
 
     def _specs(self, known: Model | None) -> NetworkSpecs:
         """With weight norm, as DeepSDF has it; of a model's size if there is one."""
+        said = _said(self, *DEEPSDF)
         if known is None:
-            size = {**DEEPSDF, **_said(self, *DEEPSDF)}
+            size = {**DEEPSDF, **said}
             layers, width, code_length = size.values()
             if min(layers, width) < 1:
                 raise ValueError(f"--layers {layers} --width {width} were given; a network has at least one of each")
             return NetworkSpecs((width,) * layers, code_length, (layers // 2,), norm_layers=tuple(range(layers)))
-        said = _said(self, *DEEPSDF)
         if said:
             sizes = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in said.items())
             raise ValueError(f"{sizes} was given beside --begin-with {known.name}, whose size the network takes")

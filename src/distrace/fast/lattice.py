@@ -73,11 +73,12 @@ class Lattice:
 
     @torch.no_grad()
     def lowest(self, rays: Rays, bounds: Bounds, but: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-        """Where along rays the value is least, to a cell, farther than two cells from some distances."""
+        """Where along rays of the world the value is least, to a cell, farther than two cells from some distances."""
         apart, at, least = (bounds.far - bounds.near) / SAMPLES, but, torch.full_like(but, torch.inf)
         for k in range(SAMPLES):
             t = bounds.near + (k + 0.5) * apart
-            value = self(rays.at(t))[0].masked_fill((t - but).abs() < 2 * self.cell, torch.inf)
+            value = self(rays.at(t) / self.radius)[0]
+            value = value.masked_fill((t - but).abs() < 2 * self.cell * self.radius, torch.inf)
             at, least = torch.where(value < least, t, at), value.minimum(least)
         return at
 
