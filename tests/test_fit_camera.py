@@ -143,12 +143,14 @@ def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
     assert percent < limit
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_from_normals_alone_the_orientation_is_found() -> None:
     observed = view(dtype=torch.float32)
     degrees, _ = pose_error(found(only(observed, "normal"), turned(observed.camera, 10)), observed.camera)
     assert degrees < 0.5
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_where_one_start_leads_nowhere_another_does() -> None:
     observed = view(dtype=torch.float32)
     start = turned(observed.camera, 70)

@@ -255,6 +255,7 @@ def turned(view: Photograph, degrees: float) -> Photograph:
     return replace(view, camera=replace(view.camera, T_world_camera=turn @ view.camera.T_world_camera))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_view_whose_camera_is_turned_is_named() -> None:
     seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
     assert not any(view.doubtful for view in overlaps(seen))
@@ -262,6 +263,7 @@ def test_a_view_whose_camera_is_turned_is_named() -> None:
     assert [view.name for view in found if view.doubtful] == ["02"]
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
     above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
@@ -351,6 +353,7 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
             parted(views, every)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_command_writes_a_mesh_in_the_folders_world(views: list[Photograph], tmp_path: Path, run: Command) -> None:
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))

@@ -25,6 +25,7 @@ def photographs(count: int = 24, size: int = 120) -> list[Photograph]:
     return found
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_points_of_a_painted_ball_lie_on_it() -> None:
     pytest.importorskip("cv2")
     points = stereo_points(photographs())

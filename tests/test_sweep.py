@@ -54,6 +54,7 @@ def test_depths_that_are_sure_are_right(bowl: list[Photograph]) -> None:
         assert (off < OFF).float().mean() > 0.8  # of the rest windows reach across an edge
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_hollow_is_carved_that_no_outline_shows(bowl: list[Photograph]) -> None:
     steps = torch.linspace(-0.95, 0.95, 40)
     places = torch.cartesian_prod(steps, steps, steps)
@@ -65,6 +66,7 @@ def test_a_hollow_is_carved_that_no_outline_shows(bowl: list[Photograph]) -> Non
     assert (carved(places[true < -0.05]) < 0).float().mean() > 0.99, "what is there stays"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_network_begins_with_a_hollow_where_that_is_asked_for(bowl: list[Photograph]) -> None:
     specs, hollow = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4), torch.tensor([[0.0, 0.0, 0.5]])
     found = []
@@ -78,6 +80,7 @@ def test_a_network_begins_with_a_hollow_where_that_is_asked_for(bowl: list[Photo
     assert open_ > 0.05
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_nothing_is_seen_through_where_nothing_tells_depths(bowl: list[Photograph]) -> None:
     plain = [replace(view, image=torch.full_like(view.image, 0.5)) for view in bowl]
     places = 2 * torch.rand(2000, 3, generator=torch.Generator().manual_seed(0)) - 1

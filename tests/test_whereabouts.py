@@ -35,6 +35,7 @@ def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool
     assert float(there.scale) == pytest.approx(0.8, abs=0.05)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> None:
     lost = placed(bumpy_balls().field(TRUE), torch.diag(torch.tensor([0.3, 0.3, 0.3, 1.0])))
     some = views[::2]
