@@ -198,6 +198,7 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
         assert facts["evaluations"] > 1000
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
     options = ("--points", 50, "--solver", "adam", "--iterations", 30, "--starts", 2, "--resolution", 16)
@@ -404,6 +405,7 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
     assert Image.open(out / "filmstrip.png").width > 100
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:

@@ -162,6 +162,7 @@ def test_where_one_start_leads_nowhere_another_does() -> None:
     assert pose_error(alone[-1].camera, observed.camera)[0] > 5
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_camera_that_looks_away_is_turned_to_the_object() -> None:
     observed = view(dtype=torch.float32)
     away = turned_object(observed.camera, torch.zeros(3), torch.tensor([0, 6.0, 0]))

@@ -43,6 +43,7 @@ def bowl() -> list[Photograph]:
     return photographed(BOWL, [Camera.orbit(*place, 3.0, height=120, width=120, focal_px=160.0) for place in places])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_depths_that_are_sure_are_right(bowl: list[Photograph]) -> None:
     for depths, view in zip(swept(bowl), bowl, strict=True):
         with torch.no_grad():
