@@ -18,7 +18,7 @@ beartype.beartype = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower
 
 @pytest.fixture
 def unchecked() -> Iterator[None]:
-    """Without the checks of shapes and types, half of a long test's time: shorter ones call the same functions."""
+    """Without the checks of shapes and types, half of a long test's time; for those whose parts other tests check."""
     jaxtyping.config.update("jaxtyping_disable", True)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)

@@ -198,7 +198,6 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
         assert facts["evaluations"] > 1000
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
     options = ("--points", 50, "--solver", "adam", "--iterations", 30, "--starts", 2, "--resolution", 16)
@@ -293,7 +292,6 @@ def test_invent_writes_meshes_that_are_sampled_and_learnt_with_the_class(run: Co
     assert load_model(tmp_path / "model").shapes == ("tables~1", "tables~2", "tables~3")
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_evaluate_held_out_tells_a_model_all_distances(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
 ) -> None:
@@ -310,7 +308,6 @@ def depth_table(model: Path, spheres_split: tuple[Path, Path], run: Command, tmp
     return lambda name: run("evaluate", name, *where, "--methods", "points", "--views", 1, "--jobs", 1)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_evaluate_sparse_depth_writes_a_table_and_goes_on(depth_table: Callable[[str], None], tmp_path: Path) -> None:
     depth_table("sparse-depth")
     facts = result(tmp_path, "rows", "ratios", "instances", "evaluations")
@@ -321,7 +318,6 @@ def test_evaluate_sparse_depth_writes_a_table_and_goes_on(depth_table: Callable[
     assert {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")} == before
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_evaluate_focal_also_looks_at_what_was_fitted_through_other_focal_lengths(
     depth_table: Callable[[str], None], tmp_path: Path
 ) -> None:
@@ -332,7 +328,6 @@ def test_evaluate_focal_also_looks_at_what_was_fitted_through_other_focal_length
     assert all(0 < row["iou_median"] <= 1 and row["depth_error_median"] < 0.5 for row in facts["tests"])
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_evaluate_spread_correlates_spread_and_error(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
 ) -> None:
@@ -357,7 +352,6 @@ def test_evaluate_splits_and_card_describe_what_a_model_was_trained_on(
     assert "| held | held out | me | CC0-1.0 |" in said
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_evaluate_choices_trains_small_networks(
     spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -405,7 +399,6 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
     assert Image.open(out / "filmstrip.png").width > 100
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:

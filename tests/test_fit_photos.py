@@ -172,7 +172,6 @@ def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Ph
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_code_and_a_place_are_found_together(decoder: Decoder) -> None:
     moved = photographs(decoder, ring(), MOVED)
     config = replace(CONFIG, iterations=20, compared=replace(COMPARED, moves=True))

@@ -255,7 +255,6 @@ def turned(view: Photograph, degrees: float) -> Photograph:
     return replace(view, camera=replace(view.camera, T_world_camera=turn @ view.camera.T_world_camera))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_view_whose_camera_is_turned_is_named() -> None:
     seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
     assert not any(view.doubtful for view in overlaps(seen))

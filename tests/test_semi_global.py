@@ -25,7 +25,6 @@ def photographs(count: int = 24, size: int = 120) -> list[Photograph]:
     return found
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_points_of_a_painted_ball_lie_on_it() -> None:
     pytest.importorskip("cv2")
     points = stereo_points(photographs())
@@ -35,7 +34,6 @@ def test_points_of_a_painted_ball_lie_on_it() -> None:
     assert np.quantile(off, 0.95) < 0.05
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_rectified_views_see_the_origin_in_their_middle_columns_and_same_rows() -> None:
     pytest.importorskip("cv2")
     first, second = photographs(24, 60)[:2]

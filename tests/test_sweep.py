@@ -55,7 +55,6 @@ def test_depths_that_are_sure_are_right(bowl: list[Photograph]) -> None:
         assert (off < OFF).float().mean() > 0.8  # of the rest windows reach across an edge
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_hollow_is_carved_that_no_outline_shows(bowl: list[Photograph]) -> None:
     steps = torch.linspace(-0.95, 0.95, 40)
     places = torch.cartesian_prod(steps, steps, steps)
