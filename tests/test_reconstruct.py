@@ -25,13 +25,15 @@ from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.field import SDF, value_and_gradient
 from distrace.pages.reconstruction_page import judged
+from distrace.photographs.agreed_depths import NO_DEPTHS
 from distrace.photographs.hull import overlaps, visual_hull
 from distrace.primitives import box, sphere, torus
 from distrace.rays import Rays, meet_sphere
+from distrace.reconstruction.beginning import begin
 from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import between, drift, motions, moved, relative
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.registration import registered
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import (
@@ -51,7 +53,7 @@ CPU = torch.device("cpu")
 SMALL = SurfaceSpecs(
     width=32, layers=2, frequencies=3, features=4, grid=GridSpecs(levels=3, finest=32, entries=512), colour_width=32
 )
-SHORT = ReconstructConfig(steps=150, hull_steps=200, sizes=(32,), rays=256, learning_rate=5e-3, retouching=30)
+SHORT = ReconstructConfig(steps=150, beginning=200, sizes=(32,), rays=256, learning_rate=5e-3, retouching=30)
 
 
 Command = Callable[..., None]
@@ -231,14 +233,14 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photog
     assert (hull(0.3 * directions) < -0.1).all()
     assert (hull(0.9 * directions) > 0.2).all()
     state = Reconstruction.fresh(SMALL, SHORT, 8, CPU)
-    begin_with_hull(state, ball, SHORT)
+    begin(state, ball, SHORT, NO_DEPTHS)
     assert state.surface(0.5 * directions).abs().median() < 0.04
 
 
 def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
     empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
     with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
-        begin_with_hull(Reconstruction.fresh(SMALL, SHORT, 8, CPU), empty, SHORT)
+        begin(Reconstruction.fresh(SMALL, SHORT, 8, CPU), empty, SHORT, NO_DEPTHS)
 
 
 def seen_by(sdf: SDF, cameras: Sequence[Camera]) -> list[Photograph]:

@@ -17,8 +17,11 @@ from distrace.data.photographs import load_photographs, notes
 from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
 from distrace.pages.reconstruction_page import judged
+from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths
 from distrace.photographs.hull import Overlap, overlaps
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, begin_with_hull, reconstruct
+from distrace.photographs.sweep import swept
+from distrace.reconstruction.beginning import begin
+from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.shading import save_png
@@ -42,7 +45,6 @@ class Reconstruct:
     rays: int = ReconstructConfig.rays  # of each step
     width: int = SurfaceSpecs.width  # of the surface's network
     silhouettes_only: Flag = False  # colours do not shape the surface: a visual hull, painted
-    carved: Flag = False  # begin without what views see through: courts and hollows, which no outline shows
     held_out: int = 8  # one view in so many is not fitted to, but compared; 0 for none
     leave_out: tuple[str, ...] = ()  # names of views that are not used at all
     resolution: int = 256  # of the mesh
@@ -68,7 +70,7 @@ class Reconstruct:
 
     @property
     def config(self) -> ReconstructConfig:
-        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "carved", "seed")}
+        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "seed")}
         return ReconstructConfig(**own, colours_shape=not self.silhouettes_only)
 
     @property
@@ -113,18 +115,19 @@ def fitted(
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
     marks = [mark(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
+    depths = _agreed_depths(views) if config.colours_shape and state.step < config.steps else NO_DEPTHS
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
-        console.print("carving what the masks allow, and teaching the network that")
+        console.print("teaching the network what outlines and depths tell")
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
-        begin_with_hull(state, views, config)
+        begin(state, views, config, depths)
     names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     saved, due = time.perf_counter(), -(-config.total // PREVIEWS)
     with progress("reconstructing", config.total) as bar:
-        for step in reconstruct(views, state, config):
+        for step in reconstruct(views, state, config, depths):
             bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.course.items()), to=step.step)
             if step.step % due == 0:
                 small = judged(state, shown, PREVIEWED)
@@ -134,6 +137,13 @@ def fitted(
                 saved = time.perf_counter()
     save_reconstruction(run.out, state, config, marks)
     return state
+
+
+def _agreed_depths(views: Sequence[Photograph]) -> AgreedDepths:
+    console.print("comparing photographs with their neighbours")
+    found = AgreedDepths.of(swept(views))
+    console.print(f"{len(found):,} depths agree")
+    return found
 
 
 def _doubt(view: Overlap) -> str:

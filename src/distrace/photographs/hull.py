@@ -17,7 +17,6 @@ from distrace.data.carving import looked_up
 from distrace.data.photograph import Photograph
 from distrace.field import SDF
 from distrace.metrics import iou
-from distrace.photographs.sweep import seen_through
 from distrace.rays import meet_sphere
 from distrace.trace import TraceConfig, sphere_trace
 
@@ -82,17 +81,6 @@ def visual_hull(photographs: Sequence[Photograph]) -> SDF:
     Raises `ValueError` for photographs without masks, or masks without anything in common.
     """
     return _distances(_allowed(photographs, WRONG)[1])
-
-
-def carved_hull(photographs: Sequence[Photograph]) -> SDF:
-    """The same, without what views see through: hollows and courts, which no outline shows.
-
-    Raises `ValueError` as `visual_hull` does.
-    """
-    places, hull = _allowed(photographs, WRONG)
-    rows, left = hull.nonzero()[:, 0], hull.clone()
-    left[rows] = ~seen_through(photographs, places[rows])
-    return _distances(left if left.any() else hull)
 
 
 def _allowed(photographs: Sequence[Photograph], wrong: float, least: float = 0.0) -> tuple[Tensor, Tensor]:

@@ -25,8 +25,6 @@ EVEN = 4e-4  # variance of brightness below which a window says nothing
 ALIKE = 0.7  # correlation of a sure match, …
 ALONE, BESIDE = 0.1, 4  # … and by how much it beats all that are farther than so many planes away
 OFF = 0.03  # radii: how far depths that are sure may be wrong
-AGREED = 3  # views that must see through a place, …
-OUTVOTED = 2  # … and × as many as see something there
 
 
 @dataclass(frozen=True)
@@ -47,17 +45,6 @@ class Depths:
         through[shown] = self.sure[row, column] & (before > OFF)
         there[shown] = self.sure[row, column] & (before.abs() <= OFF)
         return through, there
-
-
-@torch.no_grad()
-def seen_through(photographs: Sequence[Photograph], points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Which points several views look through, by depths that neighbours agree on. Needs masks."""
-    through, there = torch.zeros(2, len(points))
-    for depths in swept(photographs):
-        free, filled = depths.votes(points)
-        through += free
-        there += filled
-    return (through >= AGREED) & (through > OUTVOTED * there)
 
 
 @torch.no_grad()

@@ -13,18 +13,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.photograph import Photograph
-from distrace.field import value_and_gradient
-from distrace.photographs.hull import carved_hull, visual_hull
+from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.motions import motions, relative
 from distrace.reconstruction.retouch import Canvas
 from distrace.reconstruction.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
-from distrace.reconstruction.terms import SHELL, Pool, terms_of, unit_length
+from distrace.reconstruction.terms import Pool, terms_of
 from distrace.training.course import record
 
-SURVEYED = 400_000  # points, of which those near the hull's surface are kept
 STEEPEST = 1.0  # norm of the gradient by the surface's weights: a few rays that graze must not throw it off
-UNIT = 0.02  # of the hull's loss: how much the length of the gradient counts
 
 
 @dataclass(frozen=True)
@@ -32,7 +29,7 @@ class ReconstructConfig:
     """The schedule. Sizes are the longer sides of the images, in pixels: coarse ones, then finer ones."""
 
     steps: int = 16_000
-    hull_steps: int = 1500  # before, of the surface alone, towards the visual hull
+    beginning: int = 1500  # steps before, of the surface alone, towards the visual hull and what depths tell
     sizes: tuple[int, ...] = (160, 320)
     rays: int = 1024  # of a step: half of the object, half around it
     learning_rate: float = 1e-3  # of the colours' network …
@@ -42,14 +39,14 @@ class ReconstructConfig:
     colour: float = 1.0  # the weights of the terms
     patches: float = 0.5
     outline: float = 200.0
-    eikonal: float = 1.0
+    eikonal: float = 10.0
+    depths: float = 20.0
     sharpness: float = 100.0  # of an outline at first, per radius: it doubles …
     sharpenings: int = 3  # … so often, evenly over the steps
     painting: float = 0.05  # of the steps, at first, in which colours are learnt and do not shape the surface
     retouching: int = 1000  # steps after all others, of the colours alone …
     retouched: int = 4096  # … and the pixels of each
     colours_shape: bool = True  # without, only outlines shape the surface: a visual hull
-    carved: bool = False  # begin without what views see through, by depths that their neighbours agree on
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -126,36 +123,11 @@ class Step:
     seconds: float
 
 
-def begin_with_hull(state: Reconstruction, photographs: Sequence[Photograph], config: ReconstructConfig) -> None:
-    """Teaches the surface what the masks allow: from there colours need not find what outlines know. If it is `carved`,
-    what views see through is left out, too: a court that is filled can be painted, and so stays filled.
-
-    Raises `ValueError` for photographs without masks, or masks without anything in common.
-    """
-    began = time.perf_counter()
-    hull, device = (carved_hull if config.carved else visual_hull)(photographs), state.surface.last.weight.device
-    surface = CountedSurface(state.surface)
-    random = torch.Generator().manual_seed(config.seed)
-    points = 2 * torch.rand(SURVEYED, 3, generator=random) - 1
-    near = points[hull(points).abs() < SHELL]
-    optimiser = torch.optim.Adam(state.surface.parameters())
-    for step in range(config.hull_steps):
-        optimiser.param_groups[0]["lr"] = config.learning_rate * (1 - step / config.hull_steps)
-        some = near[torch.randint(len(near), (config.rays,), generator=random)]
-        about = some + SHELL / 2 * torch.randn(some.shape, generator=random)
-        anywhere = 2 * torch.rand(config.rays, 3, generator=random) - 1
-        asked = torch.cat([about, anywhere])
-        value, gradient = value_and_gradient(surface, asked.to(device))
-        loss = (value - hull(asked).to(device)).abs().mean() + UNIT * unit_length(gradient)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-    state.evaluations += surface.evaluations
-    state.seconds += time.perf_counter() - began
-
-
 def reconstruct(
-    photographs: Sequence[Photograph], state: Reconstruction, config: ReconstructConfig = ReconstructConfig()
+    photographs: Sequence[Photograph],
+    state: Reconstruction,
+    config: ReconstructConfig = ReconstructConfig(),
+    depths: AgreedDepths = NO_DEPTHS,
 ) -> Iterator[Step]:
     """Fits in place and yields after every step, from wherever `state` is to the last one: shapes, then retouches.
 
@@ -173,6 +145,8 @@ def reconstruct(
         some, surface = pool.drawn(config.rays, random).to(device), CountedSurface(state.surface)
         shapes, sharp, moves = config.shapes(state.step), config.sharp(state.step), state.motions()
         terms = terms_of(some.moved(moves), matching.moved(moves), surface, state.colour, random, shapes, sharp)
+        if len(depths):
+            terms["depths"] = contradicted(surface(depths.drawn(config.rays // 4, random).to(device)))
         state.evaluations += surface.evaluations
         weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()])
         yield _stepped(state, weighted.sum(), terms, config, began)
