@@ -12,7 +12,8 @@ from distrace.field import SDF
 from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
 from distrace.photographs.sweep import OFF, Depths, swept
 from distrace.primitives import difference, sphere
-from distrace.reconstruction.beginning import begin
+from distrace.reconstruction import beginning
+from distrace.reconstruction.beginning import begin, telling
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.render import render
@@ -90,6 +91,23 @@ def test_a_network_begins_with_a_hollow_that_no_outline_shows(bowl: list[Photogr
     filled, open_ = found
     assert filled < -0.05
     assert open_ > 0.05
+
+
+def test_depths_are_used_where_outlines_do_not_tell_the_shape(
+    bowl: list[Photograph], depths: AgreedDepths, told: list[Depths], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(beginning, "swept", lambda _: told)
+    assert len(telling(bowl)) == len(depths)
+    monkeypatch.setattr(beginning, "visual_hull", lambda _: BOWL)
+    assert telling(bowl) is NO_DEPTHS
+    monkeypatch.setattr(beginning, "swept", lambda _: [])
+    assert telling(bowl) is NO_DEPTHS
+
+
+def test_lengths_of_gradients_count_more_with_depths() -> None:
+    config = ReconstructConfig(eikonal=0.5, firmness=4.0, colour=3.0)
+    assert [config.weight("eikonal", some) for some in (False, True)] == [0.5, 2.0]
+    assert [config.weight("colour", some) for some in (False, True)] == [3.0, 3.0]
 
 
 def test_there_are_no_depths_where_nothing_tells_them(bowl: list[Photograph]) -> None:

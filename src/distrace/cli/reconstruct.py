@@ -19,8 +19,7 @@ from distrace.mesh import MeshConfig
 from distrace.pages.reconstruction_page import judged
 from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths
 from distrace.photographs.hull import Overlap, overlaps
-from distrace.photographs.sweep import swept
-from distrace.reconstruction.beginning import begin
+from distrace.reconstruction.beginning import begin, telling
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import SurfaceSpecs
@@ -115,11 +114,11 @@ def fitted(
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
     marks = [mark(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
-    depths = _agreed_depths(views) if config.colours_shape and state.step < config.steps else NO_DEPTHS
+    depths = _telling(views) if config.colours_shape and state.step < config.steps else NO_DEPTHS
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
-        console.print("teaching the network what outlines and depths tell")
+        console.print("teaching the network what is known before colours")
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
         begin(state, views, config, depths)
@@ -139,11 +138,12 @@ def fitted(
     return state
 
 
-def _agreed_depths(views: Sequence[Photograph]) -> AgreedDepths:
+def _telling(views: Sequence[Photograph]) -> AgreedDepths:
     console.print("comparing photographs with their neighbours")
-    found = AgreedDepths.of(swept(views))
-    console.print(f"{len(found):,} depths agree")
-    return found
+    depths = telling(views)
+    if len(depths):
+        console.print(f"{len(depths):,} depths that photographs agree on tell what outlines do not")
+    return depths
 
 
 def _doubt(view: Overlap) -> str:

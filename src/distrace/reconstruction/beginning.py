@@ -12,8 +12,9 @@ from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.field import SDF, value_and_gradient
-from distrace.photographs.agreed_depths import AgreedDepths, contradicted
+from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
 from distrace.photographs.hull import visual_hull
+from distrace.photographs.sweep import swept
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction.surface_network import CountedSurface, Surface
 from distrace.reconstruction.terms import SHELL, unit_length
@@ -22,6 +23,18 @@ SURVEYED = 400_000  # points, of which those near the hull's surface are kept
 UNIT = 0.02  # how much the length of the gradient counts beside the hull …
 EVEN = 1.0  # … and beside what depths contradict: nothing else keeps what lies between them smooth
 SEEN = 2.0  # how much depths count beside outlines
+DEEP, MANY = 0.1, 0.1  # radii within the hull, and the share of depths there, that outlines do not tell
+
+
+def telling(photographs: Sequence[Photograph]) -> AgreedDepths:
+    """Depths that photographs agree on where they tell what outlines do not, of courts and hollows; none otherwise:
+    then they would only hold the surface to what few pixels tell.
+
+    Raises `ValueError` for photographs without masks, or masks without anything in common.
+    """
+    depths = AgreedDepths.of(swept(photographs))
+    within = visual_hull(photographs)(depths.rays.at(depths.distance)) < -DEEP
+    return depths if within.sum() > MANY * len(within) else NO_DEPTHS
 
 
 def begin(

@@ -39,7 +39,8 @@ class ReconstructConfig:
     colour: float = 1.0  # the weights of the terms
     patches: float = 0.5
     outline: float = 200.0
-    eikonal: float = 10.0
+    eikonal: float = 1.0
+    firmness: float = 10.0  # × `eikonal` with depths: the surface need not wander far then, and even parts stay smooth
     depths: float = 20.0
     sharpness: float = 100.0  # of an outline at first, per radius: it doubles …
     sharpenings: int = 3  # … so often, evenly over the steps
@@ -61,6 +62,10 @@ class ReconstructConfig:
     def total(self) -> int:
         """Steps, with those that retouch."""
         return self.steps + self.retouching
+
+    def weight(self, term: str, with_depths: bool) -> float:
+        """Of a term of the loss."""
+        return getattr(self, term) * (self.firmness if with_depths and term == "eikonal" else 1.0)
 
     def rate(self, step: int) -> float:
         """Falls exponentially, and once more while colours are retouched."""
@@ -148,7 +153,7 @@ def reconstruct(
         if len(depths):
             terms["depths"] = contradicted(surface(depths.drawn(config.rays // 4, random).to(device)))
         state.evaluations += surface.evaluations
-        weighted = torch.stack([getattr(config, name) * term for name, term in terms.items()])
+        weighted = torch.stack([config.weight(name, len(depths) > 0) * term for name, term in terms.items()])
         yield _stepped(state, weighted.sum(), terms, config, began)
     if state.step < config.total:
         yield from _retouched(photographs, state, config)
