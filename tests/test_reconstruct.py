@@ -233,14 +233,14 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photog
     assert (hull(0.3 * directions) < -0.1).all()
     assert (hull(0.9 * directions) > 0.2).all()
     state = Reconstruction.fresh(SMALL, SHORT, 8, CPU)
-    begin(state, ball, SHORT, NO_DEPTHS)
+    begin(state, hull, SHORT, NO_DEPTHS)
     assert state.surface(0.5 * directions).abs().median() < 0.04
 
 
 def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
     empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
     with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
-        begin(Reconstruction.fresh(SMALL, SHORT, 8, CPU), empty, SHORT, NO_DEPTHS)
+        begin(Reconstruction.fresh(SMALL, SHORT, 8, CPU), visual_hull(empty), SHORT, NO_DEPTHS)
 
 
 def seen_by(sdf: SDF, cameras: Sequence[Camera]) -> list[Photograph]:

@@ -10,6 +10,7 @@ from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.field import SDF
 from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
+from distrace.photographs.hull import visual_hull
 from distrace.photographs.sweep import OFF, Depths, swept
 from distrace.primitives import difference, sphere
 from distrace.reconstruction import beginning
@@ -83,10 +84,11 @@ def test_depths_contradict_what_fills_a_hollow_and_what_lacks(depths: AgreedDept
 @pytest.mark.usefixtures("unchecked")
 def test_a_network_begins_with_a_hollow_that_no_outline_shows(bowl: list[Photograph], depths: AgreedDepths) -> None:
     specs, hollow = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4), torch.tensor([[0.0, 0.0, 0.5]])
-    config, found = ReconstructConfig(beginning=450, rays=256, learning_rate=5e-3), []
+    config, hull, found = ReconstructConfig(beginning=450, rays=256, learning_rate=5e-3), visual_hull(bowl), []
     for some in (NO_DEPTHS, depths):
         state = Reconstruction.fresh(specs, config, len(bowl), torch.device("cpu"))
-        begin(state, bowl, config, some)
+        begin(state, hull, config, some)
+        assert (state.surface(torch.tensor([[0.0, 0.0, -0.4], [0.65, 0.0, 0.1]])) < 0).all(), "what is there stays"
         found.append(state.surface(hollow).item())
     filled, open_ = found
     assert filled < -0.05
@@ -97,11 +99,10 @@ def test_depths_are_used_where_outlines_do_not_tell_the_shape(
     bowl: list[Photograph], depths: AgreedDepths, told: list[Depths], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(beginning, "swept", lambda _: told)
-    assert len(telling(bowl)) == len(depths)
-    monkeypatch.setattr(beginning, "visual_hull", lambda _: BOWL)
-    assert telling(bowl) is NO_DEPTHS
+    assert len(telling(bowl, visual_hull(bowl))) == len(depths)
+    assert telling(bowl, BOWL) is NO_DEPTHS
     monkeypatch.setattr(beginning, "swept", lambda _: [])
-    assert telling(bowl) is NO_DEPTHS
+    assert telling(bowl, sphere(0.8)) is NO_DEPTHS
 
 
 def test_lengths_of_gradients_count_more_with_depths() -> None:

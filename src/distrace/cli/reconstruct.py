@@ -18,7 +18,7 @@ from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
 from distrace.pages.reconstruction_page import judged
 from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths
-from distrace.photographs.hull import Overlap, overlaps
+from distrace.photographs.hull import Overlap, overlaps, visual_hull
 from distrace.reconstruction.beginning import begin, telling
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
@@ -114,14 +114,12 @@ def fitted(
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
     marks = [mark(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
-    depths = _telling(views) if config.colours_shape and state.step < config.steps else NO_DEPTHS
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
     else:
-        console.print("teaching the network what is known before colours")
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
-        begin(state, views, config, depths)
+    depths = _begun(state, views, config)
     names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     saved, due = time.perf_counter(), -(-config.total // PREVIEWS)
@@ -138,11 +136,20 @@ def fitted(
     return state
 
 
-def _telling(views: Sequence[Photograph]) -> AgreedDepths:
-    console.print("comparing photographs with their neighbours")
-    depths = telling(views)
-    if len(depths):
-        console.print(f"{len(depths):,} depths that photographs agree on tell what outlines do not")
+def _begun(state: Reconstruction, views: Sequence[Photograph], config: ReconstructConfig) -> AgreedDepths:
+    """A fresh run begins; the depths that count in the steps that are left."""
+    depths, compared = NO_DEPTHS, config.colours_shape and state.step < config.steps
+    if state.step and not compared:
+        return depths
+    hull = visual_hull(views)
+    if compared:
+        console.print("comparing photographs with their neighbours")
+        depths = telling(views, hull)
+        if len(depths):
+            console.print(f"{len(depths):,} depths that photographs agree on tell what outlines do not")
+    if not state.step:
+        console.print("teaching the network what is known before colours")
+        begin(state, hull, config, depths)
     return depths
 
 

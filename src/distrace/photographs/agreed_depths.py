@@ -63,8 +63,10 @@ def _confirmed(one: Depths, others: Sequence[Depths]) -> tuple[Tensor, Tensor, T
     """Origins and directions of its rays, where they enter the unit sphere, and the surface."""
     rays, distance = one.camera.rays()[one.sure], (one.depth / one.camera.cosines())[one.sure]
     points, bounds = rays.at(distance), meet_sphere(rays)
-    votes = [other.votes(points) for other in others]
-    through = sum((free.int() for free, _ in votes), torch.zeros(len(points), dtype=torch.int))
-    there = sum((filled.int() for _, filled in votes), torch.zeros(len(points), dtype=torch.int))
+    through, there = torch.zeros(2, len(points))
+    for other in others:
+        free, filled = other.votes(points)
+        through += free
+        there += filled
     kept = (there >= CONFIRMED) & (there > through) & (points.norm(dim=-1) < 1) & bounds.meets
     return rays.origins[kept], rays.directions[kept], bounds.near[kept], distance[kept]

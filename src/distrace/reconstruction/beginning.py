@@ -13,7 +13,6 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.field import SDF, value_and_gradient
 from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
-from distrace.photographs.hull import visual_hull
 from distrace.photographs.sweep import swept
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction.surface_network import CountedSurface, Surface
@@ -26,27 +25,21 @@ SEEN = 2.0  # how much depths count beside outlines
 DEEP, MANY = 0.1, 0.1  # radii within the hull, and the share of depths there, that outlines do not tell
 
 
-def telling(photographs: Sequence[Photograph]) -> AgreedDepths:
-    """Depths that photographs agree on where they tell what outlines do not, of courts and hollows; none otherwise:
-    then they would only hold the surface to what few pixels tell.
+def telling(photographs: Sequence[Photograph], hull: SDF) -> AgreedDepths:
+    """Depths that photographs agree on where they tell what outlines, and so the hull, do not, of courts and hollows;
+    none otherwise: then they would only hold the surface to what few pixels tell.
 
-    Raises `ValueError` for photographs without masks, or masks without anything in common.
+    Raises `ValueError` for photographs without masks.
     """
     depths = AgreedDepths.of(swept(photographs))
-    within = visual_hull(photographs)(depths.rays.at(depths.distance)) < -DEEP
+    within = hull(depths.rays.at(depths.distance)) < -DEEP
     return depths if within.sum() > MANY * len(within) else NO_DEPTHS
 
 
-def begin(
-    state: Reconstruction, photographs: Sequence[Photograph], config: ReconstructConfig, depths: AgreedDepths
-) -> None:
-    """Teaches the surface the visual hull, and then, if there are any, depths: where they say nothing it stays.
-
-    Raises `ValueError` for photographs without masks, or masks without anything in common.
-    """
-    began = time.perf_counter()
-    hull, surface = visual_hull(photographs), CountedSurface(state.surface)
-    device = state.surface.last.weight.device
+def begin(state: Reconstruction, hull: SDF, config: ReconstructConfig, depths: AgreedDepths) -> None:
+    """Teaches the surface the visual hull, and then, if there are any, depths: where they say nothing it stays."""
+    began, device = time.perf_counter(), state.surface.last.weight.device
+    surface = CountedSurface(state.surface)
     random = torch.Generator().manual_seed(config.seed)
     points = 2 * torch.rand(SURVEYED, 3, generator=random) - 1
     near = points[hull(points).abs() < SHELL]
