@@ -3,13 +3,13 @@ with those of the CPU, as CUDA's do. So what forgets to move something is found 
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from functools import partial
 from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten, tree_map
 
 DEVICE = torch.device("meta")
 ATEN = torch.ops.aten
@@ -59,14 +59,14 @@ def there(tensor: Tensor) -> Tensor:
 
 def done(func: Any, args: tuple, kwargs: dict) -> Any:
     """What an operation gives, on the device where it would be; raises `RuntimeError` where it mixes devices."""
-    values = [each for each in tree_flatten((args, kwargs))[0] if isinstance(each, Tensor)]
+    values: list[Tensor] = []
+    inner_args, inner_kwargs = _mapped(partial(_noted, values), (args, kwargs))
     wanted = kwargs.get("device")
     ours = any(isinstance(each, There) for each in values)
     if func not in MOVE and ours:
         _refuse_mixed(func, args, values)
     if wanted is not None:
-        kwargs = {**kwargs, "device": torch.device("cpu")}
-    inner_args, inner_kwargs = tree_map(lambda x: x.inner if isinstance(x, There) else x, (args, kwargs))
+        inner_kwargs["device"] = torch.device("cpu")
     result = func(*inner_args, **inner_kwargs)
     if func is ATEN._local_scalar_dense.default:
         return result
@@ -74,7 +74,21 @@ def done(func: Any, args: tuple, kwargs: dict) -> Any:
         return args[0]
     if torch.device(wanted) != DEVICE if wanted is not None else not ours:
         return result
-    return tree_map(lambda x: There(x) if isinstance(x, Tensor) else x, result)
+    return _mapped(There, result)
+
+
+def _noted(values: list[Tensor], tensor: Tensor) -> Tensor:
+    values.append(tensor)
+    return tensor.inner if isinstance(tensor, There) else tensor
+
+
+def _mapped(change: Callable[[Tensor], Tensor], given: Any) -> Any:
+    """With all tensors in it changed, also those in lists, tuples and dicts."""
+    if isinstance(given, Tensor):
+        return change(given)
+    if isinstance(given, dict):
+        return {name: _mapped(change, each) for name, each in given.items()}
+    return type(given)([_mapped(change, each) for each in given]) if type(given) in (list, tuple) else given
 
 
 def _refuse_mixed(func: Any, args: tuple, values: list[Tensor]) -> None:

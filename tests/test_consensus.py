@@ -1,5 +1,6 @@
 """What several views together allow: pixels beside a ball that look like it in one view only."""
 
+import pytest
 import torch
 from test_fit_photos import ring
 
@@ -12,24 +13,25 @@ CAMERAS = ring(size=SIZE)
 CONSENSUS = Consensus.of(CAMERAS)
 
 
+@pytest.fixture(scope="module")
 def masks() -> list[torch.Tensor]:
     return [render(sphere(0.4), camera).mask for camera in CAMERAS]
 
 
-def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept() -> None:
-    likely = masks()
+def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept(masks: list[torch.Tensor]) -> None:
+    likely = list(masks)
     likely[3] = likely[3].clone()
     likely[3][:8, :8] = True  # a neighbour of the same colour
     shown = CONSENSUS.agreed(likely)
     assert not shown[3][:8, :8].any()
-    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
+    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
 
-def test_what_one_view_lacks_is_kept() -> None:
-    likely = masks()
+def test_what_one_view_lacks_is_kept(masks: list[torch.Tensor]) -> None:
+    likely = list(masks)
     likely[3] = torch.zeros_like(likely[3])
     shown = CONSENSUS.agreed(likely)
-    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks(), shown, strict=True))
+    assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
 
 def test_without_anything_likely_nothing_is_possible() -> None:

@@ -12,13 +12,15 @@ from test_train import finished, spheres
 import distrace.cli.console
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
-from distrace.cli import _run, multiview
+from distrace.cli import _run, multiview, pose
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, save_photographs
 from distrace.data.placement import Placement
 from distrace.data.view import View
+from distrace.fitting import methods
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.fit_samples import SampleFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of
 from distrace.pages import views_page
 from distrace.photographs.fit_photos import PhotoConfig
@@ -72,7 +74,10 @@ def test_what_is_rendered_is_on_one_device(words: str, model: Path, command: Com
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_what_is_fitted_is_on_the_models_device(model: Path, command: Command, tmp_path: Path) -> None:
+def test_what_is_fitted_is_on_the_models_device(
+    model: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pose, "FRAMES", 2)
     view, few = tmp_path / "out" / "view.npz", ("--iterations", 1, "--starts", 1, "--resolution", 16)
     command("render", model, "--size", 16)
     for words in (("complete", model, view, *few), ("pose", model, view, "--starts", 1, "--azimuth", 32)):
@@ -88,6 +93,7 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
     with torch.no_grad():
         seen = render(load_model(model).field(1), camera)
         view = View(camera, seen.depth, seen.mask, seen.normal)
+    monkeypatch.setattr(methods, "DEEPSDF", SampleFitConfig(samples=100, iterations=3))
     for config in (CodeFitConfig(iterations=1, starts=1, stages=1), FitConfig(iterations=2, starts=1)):
         with pretended(monkeypatch):
             *_, last = steps_of(load_model(model).to("meta"), view, method, config)

@@ -62,6 +62,7 @@ def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> Non
     assert step.evaluations > 0
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_two_views_recover_it_too_and_normals_help() -> None:
     other = Camera.orbit(120, -10, 2.5, height=40, width=40, focal_px=40.0)
     views = [view_of(TRUE, normal=True).sparse(30), view_of(TRUE, other, normal=True).sparse(30)]
@@ -70,6 +71,7 @@ def test_two_views_recover_it_too_and_normals_help() -> None:
     torch.testing.assert_close(step.code, TRUE, atol=0.01, rtol=0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     """One depth fits spheres of every radius; only the mask knows which.
 
@@ -89,6 +91,7 @@ def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     torch.testing.assert_close(fitted.code, TRUE, atol=0.01, rtol=0)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_from_where_nothing_is_hit_the_clearance_leads_back() -> None:
     aside = torch.tensor([0.15, -0.45, -0.3, 0.3])
     prior = Prior(aside, torch.diag(torch.tensor([0.1, 0.3, 0.3, 0.3])))
@@ -150,6 +153,7 @@ def test_a_view_from_inside_the_mean_shape_is_refused() -> None:
         next(fit_shape(Spheres(), [view_of(TRUE), View(inside, torch.full((8, 8), 0.3))], PRIOR, CONFIG))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_normals_alone_tell_where_a_sphere_is() -> None:
     view = view_of(TRUE, mask=False, normal=True)
     known = replace(view, depth=torch.full_like(view.depth, torch.inf))

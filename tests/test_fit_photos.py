@@ -1,6 +1,7 @@
 """Shapes from photographs, with an untrained decoder whose shapes are bumpy balls, painted."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import pytest
@@ -59,8 +60,9 @@ def decoder() -> Decoder:
 
 
 @pytest.fixture(scope="module")
-def views(decoder: Decoder) -> list[Photograph]:
-    return photographs(decoder, ring())
+def views(decoder: Decoder, without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
+    with without_checks():
+        return photographs(decoder, ring())
 
 
 @torch.no_grad()
@@ -168,10 +170,12 @@ def changed(problem: PhotoProblem, shape: Shape, step: Tensor) -> tuple:
     return problem.residuals(look), look.wrong
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_code_and_a_place_are_found_together(decoder: Decoder) -> None:
     moved = photographs(decoder, ring(), MOVED)
     config = replace(CONFIG, iterations=20, compared=replace(COMPARED, moves=True))

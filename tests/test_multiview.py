@@ -52,11 +52,14 @@ def save_views(folder: Path, cameras: list[Camera]) -> None:
     save_photographs(folder, Photographs(tuple(views), Placement(torch.tensor([3.0, 0, 0]).double(), 2.0), "ours"))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_views(tmp_path / "views", ring(6, 40))
     monkeypatch.setattr("distrace.cli.multiview.PhotoConfig", tiny)
+    for name in ("SHOWN", "FRAMES"):
+        monkeypatch.setattr(f"distrace.pages.views_page.{name}", 2)
     out = tmp_path / "out"
     given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed", "--rays", "500", "--resolution", "40"]
     monkeypatch.setattr("sys.argv", ["distrace", "multiview", *given])

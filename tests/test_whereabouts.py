@@ -1,5 +1,7 @@
 """Where an object lies, told from photographs of a painted bumpy ball before its shape is known."""
 
+from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import pytest
@@ -17,8 +19,9 @@ SHIFTED = Similarity(torch.eye(3), torch.tensor([0.15, -0.1, 0.12]), torch.tenso
 
 
 @pytest.fixture(scope="module")
-def views() -> list[Photograph]:
-    return photographs(bumpy_balls(), ring(), SHIFTED)
+def views(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
+    with without_checks():
+        return photographs(bumpy_balls(), ring(), SHIFTED)
 
 
 def found(views: list[Photograph], *others: SDF) -> Similarity:
@@ -26,6 +29,7 @@ def found(views: list[Photograph], *others: SDF) -> Similarity:
     return whereabouts(Stage.of(views, 1.0, COMPARED), typical, Similarity.identity())
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("masked", [False, True])
 def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool) -> None:
     if masked:
