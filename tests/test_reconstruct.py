@@ -100,17 +100,21 @@ def test_a_surface_begins_as_a_ball() -> None:
     assert (gradient * directions).sum(-1).mean() > 0.8
 
 
-def test_light_depends_on_normal_and_direction_alone() -> None:
+def test_light_depends_on_normal_direction_and_place_alone() -> None:
     torch.manual_seed(0)
     colour, points, features = ColourNetwork(SMALL), torch.randn(2, 3), torch.randn(2, SMALL.features)
     normals, directions = F.normalize(torch.randn(2, 2, 3), dim=-1)
 
-    def seen(n: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-        return colour(points, n.expand(2, 3), v.expand(2, 3), features).logit()
+    def seen(n: torch.Tensor, v: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+        return colour(place.expand(2, 3), n.expand(2, 3), v.expand(2, 3), features).logit()
 
-    one, other = seen(normals[0], directions[0]), seen(normals[1], directions[1])
-    assert not torch.allclose(one, other)
-    assert torch.allclose(one[0] - one[1], other[0] - other[1], atol=1e-5)
+    def lit(place: torch.Tensor) -> torch.Tensor:
+        return seen(normals[0], directions[0], place) - seen(normals[1], directions[1], place)
+
+    here, there = lit(points[0]), lit(points[1])
+    assert torch.allclose(here[0], here[1], atol=1e-5), "features took part"
+    assert not torch.allclose(here, torch.zeros_like(here), atol=1e-3)
+    assert not torch.allclose(here, there, atol=1e-3)
 
 
 def test_squareplus_is_smooth_and_close_to_relu() -> None:

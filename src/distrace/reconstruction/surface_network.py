@@ -30,7 +30,8 @@ class SurfaceSpecs:
     grid: GridSpecs = GridSpecs()  # of the encoding of points for colours, as fine as pixels
     colour_width: int = 64
     colour_layers: int = 2
-    light_width: int = 32
+    light_width: int = 64
+    light_frequencies: int = 2  # of the encoding of points for light: shadows and lamps nearby are smooth, too
     view_frequencies: int = 1  # of the encoding of directions: what shines is smooth
     radius: float = 0.5  # of the ball that a surface begins as
 
@@ -99,7 +100,7 @@ Surface = SurfaceNetwork | CountedSurface
 
 
 class ColourNetwork(nn.Module):
-    """Colours from 0 to 1: what a point has of its own, in a light that depends on normal and direction alone.
+    """Colours from 0 to 1: what a point has of its own, in a light of normals, directions and, smoothly, places.
 
     With both in one network, as in IDR, few photographs are learnt by heart: each gets a texture of its own, and no
     shape is told by how textures shift from one to the next.
@@ -111,7 +112,8 @@ class ColourNetwork(nn.Module):
         self.grid = HashGrid(specs.grid)
         own = specs.grid.levels * specs.grid.channels + 3 + specs.features
         self.own = _layers([own, *[specs.colour_width] * specs.colour_layers, 3])
-        self.light = _layers([6 + 6 * specs.view_frequencies, specs.light_width, specs.light_width, 3])
+        lit = 9 + 6 * (specs.view_frequencies + specs.light_frequencies)
+        self.light = _layers([lit, specs.light_width, specs.light_width, 3])
 
     def forward(
         self,
@@ -122,7 +124,8 @@ class ColourNetwork(nn.Module):
     ) -> Float[Tensor, "*batch 3"]:
         """Directions are those of rays, from the eye to the point."""
         own = self.own(torch.cat([self.grid(points), points, features], dim=-1))
-        light = self.light(torch.cat([normals, encoded(directions, self.specs.view_frequencies)], dim=-1))
+        from_where, at = self.specs.view_frequencies, self.specs.light_frequencies
+        light = self.light(torch.cat([normals, encoded(directions, from_where), encoded(points, at)], dim=-1))
         return (own + light).sigmoid()
 
 

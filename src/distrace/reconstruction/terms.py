@@ -20,7 +20,7 @@ from distrace.reconstruction.surface_network import ColourNetwork, Surface
 from distrace.surface import attach, minimum
 from distrace.trace import Trace, TraceConfig, sphere_trace
 
-MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=1e-3, steps=25, least_step=4e-3)
+MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=1e-3, steps=64, least_step=4e-3)
 NEAR_OUTLINE = 31  # pixels across the band from which half of the background's rays are drawn
 FAR_OFF = 0.1  # rays of the background that come no closer have nothing to say
 GRAZING = 0.2  # rays that meet the surface more flatly do not slide: they would be thrown off it, and not come back
