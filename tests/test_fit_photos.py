@@ -208,6 +208,7 @@ def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) ->
         fit_photos(decoder, views[:1], PRIOR)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_all_evaluations_are_counted(
     decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -197,6 +197,7 @@ def test_a_camera_between_two_moves_as_they_do() -> None:
     torch.testing.assert_close(between(steps[:1], eyes[:1], eyes[2]), steps[0])
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_disturbed_camera_is_found_again(views: list[Photograph], fitted: Reconstruction) -> None:
     off = moved(views[0], motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
     found = registered(fitted, off, SHORT)

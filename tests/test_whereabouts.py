@@ -48,6 +48,7 @@ def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> N
     assert float(found(some, lost, lost).scale) > 2 * float(there.scale), "what most of them say counts"
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_photographs_of_nothing_say_nothing(views: list[Photograph]) -> None:
     some = views[::3]
     blank = [replace(view, image=GREY.expand_as(view.image)) for view in some]
