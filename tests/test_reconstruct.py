@@ -227,10 +227,14 @@ def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reco
     assert off.quantile(0.95) < 1e-5  # between them are kinks of the colours' network, which are ReLU's
 
 
-def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(
-    views: list[Photograph], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def coarse_hull(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In an eighth of the time: the object is coarse, too."""
     monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
+
+
+@pytest.mark.usefixtures("coarse_hull")
+def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photograph]) -> None:
     cameras = [view.camera.resized(3.0) for view in views]
     ball = [
         Photograph(view.name, camera, torch.ones(camera.height, camera.width, 3), render(sphere(0.5), camera).mask)
@@ -248,11 +252,11 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(
     assert state.surface(0.5 * directions).abs().median() < 0.04
 
 
-def test_masks_with_nothing_in_common_are_told(views: list[Photograph], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
+@pytest.mark.usefixtures("coarse_hull")
+def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
     empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
     with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
-        begin(Reconstruction.fresh(SMALL, SHORT, 8, CPU), visual_hull(empty), SHORT, NO_DEPTHS)
+        visual_hull(empty)
 
 
 def seen_by(sdf: SDF, cameras: Sequence[Camera]) -> list[Photograph]:
@@ -269,17 +273,16 @@ def turned(view: Photograph, degrees: float) -> Photograph:
     return replace(view, camera=replace(view.camera, T_world_camera=turn @ view.camera.T_world_camera))
 
 
-def test_a_view_whose_camera_is_turned_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
+@pytest.mark.usefixtures("coarse_hull")
+def test_a_view_whose_camera_is_turned_is_named() -> None:
     seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
     assert not any(view.doubtful for view in overlaps(seen))
     found = overlaps([*seen[:2], turned(seen[2], 15.0), *seen[3:]])
     assert [view.name for view in found if view.doubtful] == ["02"]
 
 
-@pytest.mark.usefixtures("unchecked")
-def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
+@pytest.mark.usefixtures("unchecked", "coarse_hull")
+def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
     above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
     *others, view = seen_by(torus(0.5, 0.15), [*around, above])
@@ -368,14 +371,13 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
             parted(views, every)
 
 
-@pytest.mark.usefixtures("unchecked")
+@pytest.mark.usefixtures("unchecked", "coarse_hull")
 def test_the_command_writes_a_mesh_in_the_folders_world(
     views: list[Photograph], tmp_path: Path, run: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("distrace.cli.reconstruct.ReconstructConfig", partial(ReconstructConfig, beginning=150))
     monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 3)
     monkeypatch.setattr("distrace.reconstruction.registration.STEPS", 5)
-    monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
     out = tmp_path / "out"
