@@ -594,6 +594,8 @@ BAD = [
     ("sample {tmp}/meshes --split {tmp}/text", "lacks the columns"),
     ("train {tmp}/missing", "is no folder of samples or meshes"),
     ("train {tmp}/good --minutes nan", "--minutes nan was given"),
+    ("train {tmp}/good --save-every nan", "--save-every nan was given"),
+    ("reconstruct {tmp}/good --save-every -1", "--save-every -1.0 was given"),
     ("train {tmp}/good --layers 0", "--layers 0 --width 512 were given"),
     ("train {tmp}/samples", "is not a file of samples"),
     ("train {tmp}/good --split sofas", "holds no samples"),

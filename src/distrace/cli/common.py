@@ -1,5 +1,6 @@
 """Pieces of several commands: opening a model, and the files that a rendering leaves."""
 
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,6 +31,21 @@ Views = Annotated[
     ),
 ]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+
+
+class Every:
+    """Tells when it is time to save: seconds since it last did. Raises `ValueError` for a time that never passes."""
+
+    def __init__(self, seconds: float) -> None:
+        if not seconds >= 0:
+            raise ValueError(f"--save-every {seconds} was given; give seconds, at least 0")
+        self.seconds, self.last = seconds, time.perf_counter()
+
+    def passed(self) -> bool:
+        """Whether they have; if so, they count anew."""
+        over = time.perf_counter() - self.last > self.seconds
+        self.last = time.perf_counter() if over else self.last
+        return over
 
 
 def opened(name: str, device: torch.device) -> Model:

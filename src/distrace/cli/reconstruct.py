@@ -1,6 +1,5 @@
 """`reconstruct`: shape and colours of any object from photographs with masks or a dark background; no model needed."""
 
-import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -8,7 +7,7 @@ from pathlib import Path
 import torch
 import tyro
 
-from distrace.cli.common import Flag, Views
+from distrace.cli.common import Every, Flag, Views
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
 from distrace.data.dark import masked
@@ -52,6 +51,7 @@ class Reconstruct:
     device: str = "cpu"
 
     def run(self) -> None:
+        saving = Every(self.save_every)
         torch.set_flush_denormal(True)
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
@@ -64,7 +64,7 @@ class Reconstruct:
                 console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
         with alone(run.out):
-            state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, self.save_every)
+            state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, saving)
             Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(run, resolved)
 
     @property
@@ -109,7 +109,7 @@ def fitted(
     shown: Photograph,
     config: ReconstructConfig,
     specs: SurfaceSpecs,
-    save_every: float,
+    saving: Every,
 ) -> Reconstruction:
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
     marks = [mark(view) for view in views]
@@ -122,16 +122,15 @@ def fitted(
     depths = _begun(state, views, config)
     names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
-    saved, due = time.perf_counter(), -(-config.total // PREVIEWS)
+    due = -(-config.total // PREVIEWS)
     with progress("reconstructing", config.total) as bar:
         for step in reconstruct(views, state, config, depths):
             bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.course.items()), to=step.step)
             if step.step % due == 0:
                 small = judged(state, shown, PREVIEWED)
                 save_png(run.out / "previews" / f"{step.step:07d}.png", small.picture)
-            if time.perf_counter() - saved > save_every:
+            if saving.passed():
                 save_reconstruction(run.out, state, config, marks)
-                saved = time.perf_counter()
     save_reconstruction(run.out, state, config, marks)
     return state
 

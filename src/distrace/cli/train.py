@@ -2,7 +2,6 @@
 
 import math
 import os
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +10,7 @@ import torch
 import tyro
 
 from distrace.checkpoint import Model, save_experiment
-from distrace.cli.common import opened
+from distrace.cli.common import Every, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.data import sampled
 from distrace.data import sampling
@@ -58,12 +57,13 @@ class Train:
     def run(self) -> None:
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise ValueError(f"--minutes {self.minutes} was given; a finite time is needed, longer than none")
+        saving = Every(self.save_every)
         torch.set_flush_denormal(True)  # Adam's averages decay into denormal numbers: training was 2.3 times slower
         run = start(self.out, self.device)
         with alone(run.out):
-            self._learn(run)
+            self._learn(run, saving)
 
-    def _learn(self, run: Run) -> None:
+    def _learn(self, run: Run, saving: Every) -> None:
         """All of it, from samples to the run's result."""
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
         loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
@@ -82,7 +82,7 @@ class Train:
             if known is not None:
                 begin_with(training, loaded.names, known)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
-        loss = _run(run, loaded, training, config, self.save_every)
+        loss = _run(run, loaded, training, config, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
@@ -161,9 +161,9 @@ def _as_long_as(
     return replace(config, steps=max(int(minutes * 60 / seconds[TRIED // 2]), TRIED))
 
 
-def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, save_every: float) -> float:
+def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, saving: Every) -> float:
     """Trains to the end, saving now and then; the mean loss of the last steps."""
-    saved, loss = time.perf_counter(), training.losses[-1] if training.losses else math.nan
+    loss = training.losses[-1] if training.losses else math.nan
     with progress("training", config.steps) as bar:
         for step in run_training(samples, training, config):
             if not math.isfinite(step.loss):
@@ -173,9 +173,8 @@ def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, sa
                 )
             loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
-            if time.perf_counter() - saved > save_every:
+            if saving.passed():
                 _save(run, samples, training, config)
-                saved = time.perf_counter()
     _save(run, samples, training, config)
     return loss
 
