@@ -15,6 +15,7 @@ from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.fitting.prior import Prior
+from distrace.photographs.choice import contradictions
 from distrace.photographs.doubtful import agreements
 from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
 from distrace.photographs.pairs import Colours, partners, without_light
@@ -136,6 +137,26 @@ def test_an_object_as_grey_as_what_is_behind_it_is_told_by_its_grain() -> None:
     looks = appearance(image)
     found = Regions.of(looks.reshape(-1, 4), thought.reshape(-1)).smooth_probability(looks)
     assert found[13:27, 13:27].min() > 0.5 > found[:7].max()
+
+
+def test_a_leg_of_a_pixel_before_other_colours_is_neither_object_nor_background() -> None:
+    image = torch.tensor([0.2, 0.3, 0.8]).repeat(40, 40, 1)
+    image[:20], image[20:, 20] = torch.tensor([0.8, 0.2, 0.2]), torch.tensor([0.8, 0.2, 0.2])
+    looks = F.pad(image, (0, 1))
+    found = Regions.of(looks.reshape(-1, 4), image[..., 0].reshape(-1) > 0.5).smooth_probability(looks)
+    assert found[:16].min() > 0.9
+    assert found[25:, :17].max() < 0.1
+    assert (found[25:, 20] == 0.5).all()
+
+
+def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Decoder, views: list[Photograph]) -> None:
+    stage, still = Stage.of(views, 1.0, COMPARED), Similarity.identity()
+    small = replace(still, scale=torch.tensor(0.6))
+    shapes = [Shape(PRIOR.coordinates(TRUE), place) for place in (still, still, small)]
+    true, same, less = contradictions(stage, decoder, PRIOR, shapes, COMPARED, 0)
+    assert true == same
+    assert less[0] > 1.2 * true[0]
+    assert min(true[1], less[1]) > COMPARED.rays
 
 
 @pytest.mark.parametrize("kind", ["colour", "outline"])

@@ -1,22 +1,24 @@
 """Several starts: which of them goes on, and how many steps that takes."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import pytest
 import torch
 
-from distrace.fitting.starts import Starts, Step, best_of, stages_of
+from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, by_recent_losses, stages_of
+
+Compare = Callable[[Sequence[Sequence[Step]]], Sequence[Step]]
 
 
-def run(losses: list[list[float]], starts: Starts, recent: int = 8) -> list[tuple[int, int, float]]:
+def run(losses: list[list[float]], starts: Starts, compare: Compare = by_recent_losses) -> list[tuple[int, int, float]]:
     """Starts, iterations and losses of the steps, where each start's losses are known before."""
 
     def going(start: int) -> Iterator[Step]:
         for iteration, loss in enumerate(losses[start], 1):
             yield Step(start, iteration, loss, {}, torch.zeros(2), seconds=1.0, evaluations=10)
 
-    return [(step.start, step.iteration, step.seconds) for step in best_of(starts, going, recent=recent)]
+    return [(step.start, step.iteration, step.seconds) for step in best_of(starts, going, compare)]
 
 
 def test_all_are_tried_and_the_best_goes_on() -> None:
@@ -25,15 +27,15 @@ def test_all_are_tried_and_the_best_goes_on() -> None:
     assert len(steps) == Starts(iterations=4, starts=3, trial=2).total
 
 
-@pytest.mark.parametrize(("recent", "best"), [(1, 0), (2, 1)])
-def test_a_trial_is_judged_by_its_last_losses(recent: int, best: int) -> None:
-    steps = run([[1, 9, 2, 0], [9, 3, 3, 0]], Starts(iterations=4, starts=2, trial=3), recent)
+@pytest.mark.parametrize(("compare", "best"), [(by_last_loss, 0), (by_recent_losses, 1)])
+def test_a_trial_is_judged_as_one_asks(compare: Compare, best: int) -> None:
+    steps = run([[9, 9, 2, 0], [1, 3, 3, 0]], Starts(iterations=4, starts=2, trial=3), compare)
     assert steps[-1][:2] == (best, 4)
 
 
 def test_of_several_that_go_on_the_best_in_the_end_is_given_again() -> None:
     starts = Starts(iterations=3, starts=3, trial=1, kept=2)
-    steps = run([[4, 3, 1], [9, 1, 0], [5, 4, 2]], starts, recent=1)
+    steps = run([[4, 3, 1], [9, 1, 0], [5, 4, 2]], starts, by_last_loss)
     assert steps == [*((k, 1, 1.0) for k in range(3)), (0, 2, 1.0), (0, 3, 1.0), (2, 2, 1.0), (2, 3, 1.0), (0, 3, 0.0)]
     assert len(steps) == starts.total
 
@@ -47,7 +49,7 @@ def test_a_judge_may_see_the_ends_differently() -> None:
     def judge(step: Step) -> Step:
         return replace(step, verdict=-step.loss, seconds=0.5, evaluations=3)
 
-    *_, last = best_of(starts, going, judge)
+    *_, last = best_of(starts, going, by_last_loss, judge)
     assert (last.start, last.loss, last.seconds, last.evaluations) == (1, 1.0, 1.0, 6)
 
 

@@ -21,7 +21,7 @@ from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.prior import Prior
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
-from distrace.fitting.starts import Starts, Step, best_of, stages_of
+from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, stages_of
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.losses import Weights
@@ -166,7 +166,7 @@ def _best(
     def run(start: int) -> Iterator[Step]:
         return _solved(problem_of, prior, config, start, first.coordinates[start])
 
-    steps = best_of(config, run, partial(_judged, decoder, verdict), recent=1)
+    steps = best_of(config, run, by_last_loss, partial(_judged, decoder, verdict))
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps

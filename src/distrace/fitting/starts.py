@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from math import inf
+from statistics import fmean
 from typing import TypeVar
 
 from jaxtyping import Float
@@ -70,6 +71,8 @@ def stages_of(iterations: int, count: int) -> list[tuple[int, int]]:
 Stepped = TypeVar("Stepped", bound=Step)
 Judge = Callable[[Stepped], Stepped]
 """From a last step to one with a verdict, and with the time and the evaluations that this took."""
+Comparison = Callable[[Sequence[Sequence[Stepped]]], Sequence[Stepped]]
+"""The same for the last steps of several trials, which may be judged by each other."""
 
 
 def unjudged(step: Stepped) -> Stepped:
@@ -77,10 +80,22 @@ def unjudged(step: Stepped) -> Stepped:
     return replace(step, seconds=0.0, evaluations=0, verdict=step.loss)
 
 
+def by_last_loss(trials: Sequence[Sequence[Stepped]]) -> list[Stepped]:
+    return [unjudged(trial[-1]) for trial in trials]
+
+
+def by_recent_losses(trials: Sequence[Sequence[Stepped]]) -> list[Stepped]:
+    """By the means of their last losses."""
+    return [replace(unjudged(trial[-1]), verdict=fmean(step.loss for step in trial[-RECENT:])) for trial in trials]
+
+
 def best_of(
-    starts: Starts, run: Callable[[int], Iterator[Stepped]], judge: Judge[Stepped] = unjudged, recent: int = RECENT
+    starts: Starts,
+    run: Callable[[int], Iterator[Stepped]],
+    compare: Comparison[Stepped] = by_recent_losses,
+    judge: Judge[Stepped] = unjudged,
 ) -> Iterator[Stepped]:
-    """The steps of all trials, then those of the starts whose last losses are the least; the last step is the result.
+    """The steps of all trials, then those of the starts whose verdicts are the least; the last step is the result.
 
     Of several that go on the judge tells which is best: that one's step is given again, with what judging took.
     """
@@ -94,20 +109,23 @@ def best_of(
         for step in islice(going, starts.tried):
             yield step
             tried[-1].append(step)
-    order = sorted(range(len(tried)), key=lambda start: _mean_loss(tried[start][-recent:]))[: starts.kept]
+    compared = compare(tried)
+    order = sorted(range(len(tried)), key=lambda start: compared[start].verdict)[: starts.kept]
     if len(order) == 1:
-        yield next(runs[order[0]], None) or unjudged(tried[order[0]][-1])  # it may have settled
-        yield from runs[order[0]]
+        going = runs[order[0]]
+        yield _charged(next(going, None) or unjudged(tried[order[0]][-1]), compared)  # it may have settled
+        yield from going
         return
     ends = [tried[start][-1] for start in order]
     for k, start in enumerate(order):
         for ends[k] in runs[start]:
             yield ends[k]
     verdicts = [judge(end) for end in ends]
-    best = min(range(len(ends)), key=lambda k: verdicts[k].verdict)
-    seconds, evaluations = sum(v.seconds for v in verdicts), sum(v.evaluations for v in verdicts)
-    yield replace(verdicts[best], seconds=seconds, evaluations=evaluations)
+    best = min(verdicts, key=lambda end: end.verdict)
+    yield _charged(replace(best, seconds=0.0, evaluations=0), [*compared, *verdicts])
 
 
-def _mean_loss(steps: Sequence[Step]) -> float:
-    return sum(step.loss for step in steps) / len(steps)
+def _charged(step: Stepped, judged: Sequence[Stepped]) -> Stepped:
+    """With what judging took."""
+    seconds, evaluations = (sum(getattr(each, spent) for each in judged) for spent in ("seconds", "evaluations"))
+    return replace(step, seconds=step.seconds + seconds, evaluations=step.evaluations + evaluations)

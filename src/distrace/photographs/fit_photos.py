@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from statistics import median
 
 import torch
@@ -18,6 +19,7 @@ from distrace.field import Counted
 from distrace.fitting.prior import Prior
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, stages_of
+from distrace.photographs.choice import contradictions
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing, Stage
 from distrace.photographs.whereabouts import whereabouts
@@ -37,7 +39,7 @@ class PhotoConfig(Starts):
     iterations: int = 48
     starts: int = 4
     trial: int = 24
-    levels: tuple[float, ...] = (0.25, 0.25, 0.5, 0.5, *8 * (1.0,))  # of the images' size, a stage each: new rays
+    levels: tuple[float, ...] = (*4 * (0.5,), *8 * (1.0,))  # of the images' size, a stage each: new rays
     compared: Comparing = Comparing()
     scale: float = 0.06  # up to which misplaced outlines count by their squares in the first stage …
     narrowing: float = 0.6  # … and × this from one to the next, …
@@ -69,8 +71,8 @@ def fit_photos(
 
     Starts are the mean shape, the training shapes of the least loss, and one draw from the prior, all in the same
     place: that given or, if it is unknown and they contradict it less there, where the photographs tell. The one
-    whose loss is the least on the finest images goes on. On the prior's device, wherever the photographs are.
-    Raises `ValueError` for fewer than two of them.
+    that is off least by what all of them together take for the object goes on. On the prior's device, wherever the
+    photographs are. Raises `ValueError` for fewer than two of them.
     """
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
@@ -87,7 +89,9 @@ def _fitted(
         there = search.likelier(stages[0], config.compared, (there, search.told(stages[-1], there)))
     starts = [Shape(w, there) for w in search.starts(stages[0], config, there)]
     searched = time.perf_counter() - began
-    steps = best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), recent=1)
+    run = partial(_solved, decoder, stages, prior, config)
+    compare = partial(_compared, decoder, stages[-1], prior, config)
+    steps = best_of(config, lambda start: run(start, starts[start]), compare)
     step = next(steps)
     evaluations = step.evaluations + search.evaluations
     yield replace(step, seconds=step.seconds + searched, evaluations=evaluations, searched=search.evaluations)
@@ -172,3 +176,17 @@ def _solved(
             loss, code = sum(terms.values()), prior.code(shape.w)
             yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, place=shape.place)
             began = time.perf_counter()
+
+
+def _compared(
+    decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, trials: Sequence[Sequence[PhotoStep]]
+) -> list[PhotoStep]:
+    """Their ends, judged by what all of them together take for the object."""
+    began, ends = time.perf_counter(), [trial[-1] for trial in trials]
+    shapes = [Shape(prior.coordinates(end.code), end.place) for end in ends]
+    found = contradictions(stage, decoder, prior, shapes, config.compared, config.seed)
+    seconds = (time.perf_counter() - began) / len(ends)
+    return [
+        replace(end, verdict=off, seconds=seconds, evaluations=evaluations)
+        for end, (off, evaluations) in zip(ends, found, strict=True)
+    ]

@@ -50,9 +50,13 @@ class Regions:
         return found.reshape(len(self.of_object), -1).gather(0, looks[None, :, 3].long())[0]
 
     def smooth_probability(self, looks: Float[Tensor, "height width 4"]) -> Float[Tensor, "height width"]:
-        """That pixels show the object, by the mean log odds around them: parts may look like the background."""
+        """That pixels show the object, by the mean log odds around them: parts may look like the background.
+
+        Where a pixel's own odds disagree with that, nothing is told: a leg of a pixel's width is all outline.
+        """
         odds = self.probability(looks.reshape(-1, 4)).clamp(LEAST, 1 - LEAST).logit().reshape(1, 1, *looks.shape[:2])
-        return avg_pool2d(odds, AROUND, 1, AROUND // 2, count_include_pad=False)[0, 0].sigmoid()
+        around = avg_pool2d(odds, AROUND, 1, AROUND // 2, count_include_pad=False)
+        return torch.where(odds * around < 0, 0.0, around)[0, 0].sigmoid()
 
 
 def _histogram(looks: Float[Tensor, "n 4"]) -> Float[Tensor, "grains bins bins bins"]:

@@ -26,6 +26,9 @@ FACING = 0.2  # the least cosine between a normal and the direction to another v
 DOUBT = 0.3  # a colour whose certainty is less tells nothing
 WATCHED = 0.1  # rays of the background that come no closer than this are left out
 
+Labels = Sequence[Float[Tensor, "height width"]]
+"""Of each view, how certain it is that a pixel shows the object, 1, or the background, -1; 0 where nothing tells."""
+
 
 @dataclass(frozen=True)
 class Comparing:
@@ -64,15 +67,22 @@ class Stage:
 
     @torch.no_grad()
     def problem(
-        self, decoder: Decoder, prior: Prior, shape: Shape, config: Comparing, random: torch.Generator
+        self,
+        decoder: Decoder,
+        prior: Prior,
+        shape: Shape,
+        config: Comparing,
+        random: torch.Generator,
+        labels: Labels | None = None,
     ) -> tuple[PhotoProblem, Look]:
-        """Rays drawn anew, what their pixels show by what is known so far, and who else sees it."""
+        """Rays drawn anew, what their pixels show by `labels`, else by what is known so far, and who else sees it."""
         view, index = self._drawn(config.rays, random)
         rays = self._rays(view, index)
         compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
         in_object, sdf = shape.place.rays_in_object(rays), Counted(decoder.field(prior.code(shape.w)))
         trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
-        sure = self._certainty(view, index, trace.hit)
+        labels = labels or self._labels(view, index, trace.hit)
+        sure = self._read(view, index, [each[..., None] for each in labels])[:, 0]
         far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
         kept = (trace.hit | (sure > 0) | (sure < 0) & ~far).nonzero()[:, 0]
         seen = Sightings(rays, view, compared, sure)[kept]
@@ -83,6 +93,13 @@ class Stage:
         problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves, shape.place)
         problem.evaluations += sdf.evaluations
         return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
+
+    @torch.no_grad()
+    def labels(self, sdf: SDF, place: Similarity, config: Comparing, random: torch.Generator) -> Labels:
+        """What the pixels of each view show, as a shape would have it."""
+        view, index = self._drawn(config.rays, random)
+        rays = place.rays_in_object(self._rays(view, index))
+        return self._labels(view, index, sphere_trace(sdf, rays, meet_sphere(rays), MARCH).hit)
 
     def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
         """As many pixels of each view, of those whose rays meet the unit sphere."""
@@ -105,7 +122,7 @@ class Stage:
         parts = [image.reshape(-1, image.shape[-1])[index[view == number]] for number, image in enumerate(images)]
         return torch.cat(parts)
 
-    def _certainty(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Float[Tensor, "n"]:
+    def _labels(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Labels:
         """By the masks where there are some, otherwise by appearance: that of hits against all others. What looks like
         the object where most other views rule it out says nothing."""
         asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
@@ -114,14 +131,12 @@ class Stage:
         regions = Regions.of(torch.cat([asked[hit], background]), is_object)
         images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
         possible = self.consensus.agreed([image > 0 for image in images])
-        kept = [image.masked_fill((image > 0) & ~shown, 0.0) for image, shown in zip(images, possible, strict=True)]
-        sure = self._read(view, index, [image[..., None] for image in kept])[:, 0]
-        sure = sure.masked_fill(sure.abs() < DOUBT, 0.0)
-        for number, each in enumerate(self.photographs):
-            if each.mask is not None:
-                some = view == number
-                sure[some] = 2.0 * each.mask.reshape(-1)[index[some]] - 1
-        return sure
+        return [
+            image.masked_fill((image > 0) & ~shown | (image.abs() < DOUBT), 0.0)
+            if each.mask is None
+            else 2.0 * each.mask - 1
+            for each, image, shown in zip(self.photographs, images, possible, strict=True)
+        ]
 
     def _visible(
         self, view: Int[Tensor, "n"], place: Similarity, points_object: Float[Tensor, "n 3"], sdf: SDF

@@ -1,0 +1,36 @@
+"""Which of several shapes agrees best with photographs in which nobody has marked the object."""
+
+from collections.abc import Sequence
+
+import torch
+
+from distrace.decoder import Decoder
+from distrace.field import Counted
+from distrace.fitting.prior import Prior
+from distrace.photographs.residuals import Shape
+from distrace.photographs.stage import Comparing, Stage
+
+
+@torch.no_grad()
+def contradictions(
+    stage: Stage, decoder: Decoder, prior: Prior, shapes: Sequence[Shape], compared: Comparing, seed: int
+) -> list[tuple[float, int]]:
+    """Of each shape, how far it is off, by what all shapes together take for the object; and the evaluations.
+
+    By its own loss a shape that lost its legs would be best: it calls them background, and compares them no more. What
+    is told is the product of what colours and outlines are off by: how much of either is noise is not known, and a
+    likelihood whose scales are the likeliest ones is a product of powers of them.
+    """
+    fields = [Counted(decoder.field(prior.code(shape.w))) for shape in shapes]
+    told = [
+        stage.labels(sdf, shape.place, compared, torch.Generator().manual_seed(seed))
+        for sdf, shape in zip(fields, shapes, strict=True)
+    ]
+    common, found = [torch.stack(views).mean(0) for views in zip(*told, strict=True)], []
+    for sdf, shape in zip(fields, shapes, strict=True):
+        random = torch.Generator().manual_seed(seed)
+        problem, look = stage.problem(decoder, prior, shape, compared, random, common)
+        terms = problem.terms(look, problem.residuals(look))
+        off = terms["colour"] * terms["outline"] * len(look.hit)  # outlines by their sum: rays are not the same
+        found.append((off, sdf.evaluations + problem.evaluations))
+    return found
