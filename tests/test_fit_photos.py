@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import replace
+from math import inf
 
 import pytest
 import torch
@@ -151,10 +152,11 @@ def test_a_leg_of_a_pixel_before_other_colours_is_neither_object_nor_background(
 
 def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Decoder, views: list[Photograph]) -> None:
     stage, still = Stage.of(views, 1.0, COMPARED), Similarity.identity()
-    small = replace(still, scale=torch.tensor(0.6))
-    shapes = [Shape(PRIOR.coordinates(TRUE), place) for place in (still, still, small)]
-    true, same, less = contradictions(stage, decoder, PRIOR, shapes, COMPARED, 0)
+    small, away = replace(still, scale=torch.tensor(0.6)), replace(still, translation=torch.tensor([0, 0, 9.0]))
+    shapes = [Shape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
+    true, same, less, unseen = contradictions(stage, decoder, PRIOR, shapes, COMPARED, 0)
     assert true == same
+    assert unseen[0] == inf
     assert less[0] > 1.2 * true[0]
     assert min(true[1], less[1]) > COMPARED.rays
 

@@ -1,5 +1,6 @@
 """Which of several shapes agrees best with photographs in which nobody has marked the object."""
 
+import math
 from collections.abc import Sequence
 
 import torch
@@ -10,6 +11,8 @@ from distrace.fitting.prior import Prior
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing, Stage
 
+SLIGHT = 1e-6  # of either: a shape whose outlines are all right is still judged by its colours
+
 
 @torch.no_grad()
 def contradictions(
@@ -19,7 +22,8 @@ def contradictions(
 
     By its own loss a shape that lost its legs would be best: it calls them background, and compares them no more. What
     is told is the product of what colours and outlines are off by: how much of either is noise is not known, and a
-    likelihood whose scales are the likeliest ones is a product of powers of them.
+    likelihood whose scales are the likeliest ones is a product of powers of them. Infinite where no point of a shape is
+    seen by two views.
     """
     fields = [Counted(decoder.field(prior.code(shape.w))) for shape in shapes]
     told = [
@@ -31,6 +35,7 @@ def contradictions(
         random = torch.Generator().manual_seed(seed)
         problem, look = stage.problem(decoder, prior, shape, compared, random, common)
         terms = problem.terms(look, problem.residuals(look))
-        off = terms["colour"] * terms["outline"] * len(look.hit)  # outlines by their sum: rays are not the same
+        outline = terms["outline"] * len(look.hit) / compared.rays  # of all rays: those kept are not the same for all
+        off = (terms["colour"] + SLIGHT) * (outline + SLIGHT) if len(problem.pairs) else math.inf
         found.append((off, sdf.evaluations + problem.evaluations))
     return found
