@@ -37,10 +37,10 @@ class Cloud:
     def seen_from(self, camera: Camera) -> View:
         """The points as depths of the pixels that they fall into, the nearest of each; none hides another's pixel."""
         pixels, depths = camera.project(self.points)
-        column, row = pixels.floor().long().unbind(-1)
-        inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (depths > 0)
+        shown = camera.shows(pixels, depths)
+        column, row = pixels[shown].long().unbind(-1)
         flat = torch.full((camera.height * camera.width,), torch.inf)
-        flat.scatter_reduce_(0, (row * camera.width + column)[inside], depths[inside], "amin")
+        flat.scatter_reduce_(0, row * camera.width + column, depths[shown], "amin")
         return View(camera, flat.reshape(camera.height, camera.width))
 
 
