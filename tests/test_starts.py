@@ -27,10 +27,11 @@ def test_all_are_tried_and_the_best_goes_on() -> None:
     assert len(steps) == Starts(iterations=4, starts=3, trial=2).total
 
 
-@pytest.mark.parametrize(("compare", "best"), [(by_last_loss, 0), (by_recent_losses, 1)])
-def test_a_trial_is_judged_as_one_asks(compare: Compare, best: int) -> None:
-    steps = run([[9, 9, 2, 0], [1, 3, 3, 0]], Starts(iterations=4, starts=2, trial=3), compare)
-    assert steps[-1][:2] == (best, 4)
+@pytest.mark.parametrize(("compare", "best"), [(by_last_loss, 1), (by_recent_losses, 0)])
+def test_a_trial_is_judged_by_its_last_loss_or_the_mean_of_recent_ones(compare: Compare, best: int) -> None:
+    """The first two of ten are not recent: with them, the first start would be the worse one."""
+    steps = run([[99, 99, *7 * [5], 4, 0], [1, 1, *7 * [6], 3, 0]], Starts(iterations=11, starts=2, trial=10), compare)
+    assert steps[-1][:2] == (best, 11)
 
 
 def test_of_several_that_go_on_the_best_in_the_end_is_given_again() -> None:

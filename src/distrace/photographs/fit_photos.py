@@ -89,9 +89,8 @@ def _fitted(
         there = search.likelier(stages[0], config.compared, (there, search.told(stages[-1], there)))
     starts = [Shape(w, there) for w in search.starts(stages[0], config, there)]
     searched = time.perf_counter() - began
-    run = partial(_solved, decoder, stages, prior, config)
     compare = partial(_compared, decoder, stages[-1], prior, config)
-    steps = best_of(config, lambda start: run(start, starts[start]), compare)
+    steps = best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), compare)
     step = next(steps)
     evaluations = step.evaluations + search.evaluations
     yield replace(step, seconds=step.seconds + searched, evaluations=evaluations, searched=search.evaluations)
