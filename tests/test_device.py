@@ -1,7 +1,6 @@
 """Commands on a device that is not the CPU: everything that meets is on one."""
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -128,6 +127,7 @@ def test_photographs_are_brought_to_the_model(
 ) -> None:
     for name in ("SHOWN", "FRAMES"):
         monkeypatch.setattr(views_page, name, 1)
-    monkeypatch.setattr(multiview, "PhotoConfig", partial(PhotoConfig, iterations=3, trial=1, levels=(0.5, 1.0)))
+    for name in ("KNOWN_PLACE", "UNKNOWN_PLACE"):
+        monkeypatch.setattr(multiview, name, PhotoConfig(iterations=3, trial=1, approach=1, levels=(0.5, 1.0)))
     command("multiview", model, photographs, *more, "--starts", 2, "--rays", 200, "--resolution", 16)
     assert (tmp_path / "out" / "result.json").exists()

@@ -18,10 +18,11 @@ from distrace.decoder import Decoder
 from distrace.fitting.prior import Prior
 from distrace.photographs.choice import contradictions
 from distrace.photographs.doubtful import agreements
-from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
+from distrace.photographs.fit_photos import PhotoConfig, fit_photos
 from distrace.photographs.pairs import Colours, partners, without_light
 from distrace.photographs.regions import Regions, appearance
 from distrace.photographs.residuals import PhotoProblem, Shape
+from distrace.photographs.search import Search
 from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
 from distrace.rays import meet_sphere
@@ -165,7 +166,8 @@ def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Deco
 def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[Photograph], kind: str) -> None:
     compared = replace(COMPARED, moves=True, rays=600)
     shape, random = Shape(PRIOR.coordinates(TRUE) + 0.3, MOVED), torch.Generator().manual_seed(0)
-    problem, look = Stage.of(views, 1.0, compared).problem(decoder, PRIOR, shape, compared, random)
+    stage = Stage.of(views, 1.0, compared)
+    problem, look = stage.problem(stage.glimpse(decoder, PRIOR, shape, compared.rays, random), compared)
     before = problem.residuals(look)
     size = 3 * len(problem.pairs)
     rows = torch.arange(len(before.values))
@@ -199,10 +201,20 @@ def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Ph
 
 
 @pytest.mark.usefixtures("unchecked")
-def test_a_code_and_a_place_are_found_together(decoder: Decoder) -> None:
-    moved = photographs(decoder, ring(), MOVED)
-    config = replace(CONFIG, iterations=20, compared=replace(COMPARED, moves=True))
-    found = fitted(decoder, moved, config)  # of three seeds: 0.151 to 0.157 of the start
+def test_a_code_and_a_place_are_found_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked, starts = list[Similarity](), Search.starts
+
+    def asking(search: Search, stage: Stage, compared: Comparing, place: Similarity, count: int) -> list[Tensor]:
+        asked.append(place)
+        return starts(search, stage, compared, place, count)
+
+    monkeypatch.setattr(Search, "starts", asking)
+    config = replace(CONFIG, iterations=20, approach=8, compared=replace(COMPARED, moves=True))
+    steps = list(fit_photos(decoder, photographs(decoder, ring(), MOVED), PRIOR, config))
+    assert [step.name for step in steps] == ["approach"] * 8 + ["start 1"] * 20
+    assert len(steps) == config.total
+    assert [id(place) for place in asked] == [id(steps[7].place)], "starts begin where the mean shape has come to"
+    found = Shape(PRIOR.coordinates(steps[-1].code), steps[-1].place)  # of three seeds: 0.143 to 0.156 of the start
     assert error(decoder, found, MOVED) < 0.17 * error(decoder, MEAN, MOVED)
 
 
@@ -245,7 +257,7 @@ def test_all_evaluations_are_counted(
     monkeypatch.setattr(Decoder, "_run", counting)
     compared = replace(COMPARED, rays=300, moves=True)
     first, *others = fit_photos(
-        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, compared=compared)
+        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, approach=2, compared=compared)
     )
     assert first.evaluations + sum(step.evaluations for step in others) == pytest.approx(made, rel=0.01)
     assert 0 < first.searched < first.evaluations
@@ -262,7 +274,8 @@ def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite
 ) -> None:
     shape, stage = Shape(PRIOR.coordinates(TRUE), Similarity.identity()), Stage.of(views, 0.5, COMPARED)
     compared = replace(COMPARED, moves=True)
-    problem, look = stage.problem(decoder, PRIOR, shape, compared, torch.Generator().manual_seed(0))
+    glimpse = stage.glimpse(decoder, PRIOR, shape, compared.rays, torch.Generator().manual_seed(0))
+    problem, look = stage.problem(glimpse, compared)
     away = problem.moved(look, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
     rays = shape.place.rays_in_object(problem.seen.rays[problem.pairs[:, 0]])
     assert not meet_sphere(away.shape.place.rays_in_object(rays)).meets.all(), "some leave it"

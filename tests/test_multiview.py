@@ -57,11 +57,12 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_views(tmp_path / "views", ring(6, 40))
-    monkeypatch.setattr("distrace.cli.multiview.PhotoConfig", tiny)
+    monkeypatch.setattr("distrace.cli.multiview.KNOWN_PLACE", PhotoConfig(iterations=2, levels=(0.5, 1.0)))
     for name in ("SHOWN", "FRAMES"):
         monkeypatch.setattr(f"distrace.pages.views_page.{name}", 2)
     out = tmp_path / "out"
-    given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed", "--rays", "500", "--resolution", "40"]
+    given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed"]
+    given += ["--starts", "1", "--rays", "500", "--resolution", "40"]
     monkeypatch.setattr("sys.argv", ["distrace", "multiview", *given])
     main()
     wanted = {"mesh.ply", "code.npy", "report.html", "forming.gif", "result.json"}
@@ -73,10 +74,6 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     mesh = trimesh.load(out / "mesh.ply")
     assert mesh.centroid == pytest.approx([3.0, 0, 0], abs=0.8)
     assert 1.0 < mesh.extents.max() < 4.0
-
-
-def tiny(**given: object) -> PhotoConfig:
-    return PhotoConfig(**(given | {"iterations": 2, "starts": 1, "levels": (0.5, 1.0)}))  # pyright: ignore[reportArgumentType]
 
 
 def test_a_folder_without_views_ends_in_one_sentence(

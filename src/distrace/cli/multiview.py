@@ -19,7 +19,7 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
 from distrace.pages.views_page import forming, views_page
 from distrace.photographs.doubtful import Agreement, agreements
-from distrace.photographs.fit_photos import PhotoConfig, PhotoStep, fit_photos
+from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing
 
@@ -53,7 +53,8 @@ class Multiview:
         views = [view.at_most(self.size).to(run.device) for view in found.views]
         views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
         compared = Comparing(rays=self.rays, moves=not self.fixed, same_light=not self.changing_light)
-        config = PhotoConfig(starts=self.starts, seed=self.seed, compared=compared)
+        usual = KNOWN_PLACE if self.fixed else UNKNOWN_PLACE
+        config = replace(usual, starts=self.starts, seed=self.seed, compared=compared)
         steps = _fitted(model, views, config)
         last, prior = steps[-1], prior_of(model.codes)
         shape = Shape(prior.coordinates(last.code), last.place)
@@ -76,7 +77,7 @@ class Multiview:
                 "unit_sphere": found.placement.described(),
                 "doubtful": [view.name for view in agreed if view.doubtful],
                 "evaluations": sum(step.evaluations for step in steps),
-                "setup_evaluations": steps[0].searched,
+                "setup_evaluations": sum(step.searched for step in steps),
             }
         )
 
@@ -86,7 +87,7 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> l
     with progress("fitting", config.total) as bar:
         for step in fit_photos(model.decoder, views, prior_of(model.codes), config):
             steps.append(step)
-            bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+            bar.advance(f"{step.name}, loss {step.loss:.4f}")
     return steps
 
 

@@ -8,7 +8,7 @@ import json
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
 from typing import Any
@@ -32,12 +32,12 @@ from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
-from distrace.photographs.fit_photos import PhotoConfig, Search, fit_photos
-from distrace.photographs.stage import Comparing, Stage
+from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, fit_photos
+from distrace.photographs.search import Search
+from distrace.photographs.stage import Stage
 from distrace.pose import Similarity
 
 METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")
-KNOWN_PLACE = PhotoConfig(compared=Comparing(moves=False))
 MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size
 RECOVERED = (2.0, 0.02, 0.02)  # a fifth of that: to so much, the place counts as found again
 REGISTERED = 10_000  # points of each surface, for what a registration would still move
@@ -153,7 +153,7 @@ def settings_of(method: str) -> object:
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS)}")
     own = {"silhouettes": CodeFitConfig(), "stereo": None}
-    return own.get(method, (method, KNOWN_PLACE, MOVED_BY))
+    return own.get(method, (method, UNKNOWN_PLACE if "moved" in method else KNOWN_PLACE, MOVED_BY))
 
 
 def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], Similarity]:
@@ -167,9 +167,9 @@ def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[
         stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
         best = Search(model.decoder, prior).ranked(stage, KNOWN_PLACE.compared, still)[0]
         return prior.code(best[1]), still
-    moves = trial.method != "ours"
-    config = replace(KNOWN_PLACE, compared=replace(KNOWN_PLACE.compared, moves=moves))
-    *_, last = fit_photos(model.decoder, views, prior, config, disturbed(hash_of(clip["shape"])) if moves else still)
+    moved = trial.method != "ours"
+    config, place = (UNKNOWN_PLACE, disturbed(hash_of(clip["shape"]))) if moved else (KNOWN_PLACE, still)
+    *_, last = fit_photos(model.decoder, views, prior, config, place)
     return last.code, last.place
 
 

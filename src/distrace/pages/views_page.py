@@ -38,7 +38,7 @@ def views_page(
     pictures = [figure(_beside(model, last, view), view.name) for view in some]
     losses: dict[str, list[float]] = {}
     for step in steps:
-        losses.setdefault(f"start {step.start + 1}", []).append(step.loss)
+        losses.setdefault(step.name, []).append(step.loss)
     cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.doubtful else ""] for view in agreed]
     lead = f"A shape from {len(views)} photographs, by the model {model.name}. No depth was known."
     about = "How far colours, from 0 to 1, are from those of the same points in other views: the median."
@@ -48,7 +48,7 @@ def views_page(
         [
             section("Views", paragraph("Each with the outline of the shape, and the shape."), row(*pictures)),
             section("In space", scene({"Shape": mesh}, {})),
-            section("Loss", curves(losses, "iteration", "loss", True, f"start {last.start + 1}")),
+            section("Loss", curves(losses, "iteration", "loss", True, last.name)),
             section("Agreement", paragraph(about), table(["view", "colour", ""], cells)),
         ],
     )

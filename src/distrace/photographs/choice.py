@@ -6,7 +6,6 @@ from collections.abc import Sequence
 import torch
 
 from distrace.decoder import Decoder
-from distrace.field import Counted
 from distrace.fitting.prior import Prior
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing, Stage
@@ -25,17 +24,15 @@ def contradictions(
     likelihood whose scales are the likeliest ones is a product of powers of them. Infinite where no point of a shape is
     seen by two views.
     """
-    fields = [Counted(decoder.field(prior.code(shape.w))) for shape in shapes]
-    told = [
-        stage.labels(sdf, shape.place, compared, torch.Generator().manual_seed(seed))
-        for sdf, shape in zip(fields, shapes, strict=True)
+    glimpses = [
+        stage.glimpse(decoder, prior, shape, compared.rays, torch.Generator().manual_seed(seed)) for shape in shapes
     ]
+    told = [stage.labels(glimpse) for glimpse in glimpses]
     common, found = [torch.stack(views).mean(0) for views in zip(*told, strict=True)], []
-    for sdf, shape in zip(fields, shapes, strict=True):
-        random = torch.Generator().manual_seed(seed)
-        problem, look = stage.problem(decoder, prior, shape, compared, random, common)
+    for glimpse in glimpses:
+        problem, look = stage.problem(glimpse, compared, common)
         terms = problem.terms(look, problem.residuals(look))
         outline = terms["outline"] * len(look.hit) / compared.rays  # of all rays: those kept are not the same for all
         off = (terms["colour"] + SLIGHT) * (outline + SLIGHT) if len(problem.pairs) else math.inf
-        found.append((off, sdf.evaluations + problem.evaluations))
+        found.append((off, problem.evaluations))
     return found

@@ -34,7 +34,8 @@ def agreements(
 ) -> list[Agreement]:
     """Of each view, by the views that are not doubtful: the worst is left out first, for it makes its partners bad."""
     stage = Stage.of(photographs, LEVEL, config)
-    problem, look = stage.problem(decoder, prior, shape, config, torch.Generator().manual_seed(seed))
+    glimpse = stage.glimpse(decoder, prior, shape, config.rays, torch.Generator().manual_seed(seed))
+    problem, look = stage.problem(glimpse, config)
     between, doubtful = _between(problem, look, len(photographs)), set[int]()
     while True:
         off = {view: _median(between[view], doubtful | {view}) for view in range(len(photographs))}

@@ -19,7 +19,7 @@ from distrace.photographs.residuals import MARCH, Look, PhotoProblem, PhotoWeigh
 from distrace.pose import Similarity
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import normals
-from distrace.trace import sphere_trace
+from distrace.trace import Trace, sphere_trace
 
 LEAVING = 0.03  # from a surface point towards another view, before a surface in between can hide it
 FACING = 0.2  # the least cosine between a normal and the direction to another view
@@ -46,6 +46,21 @@ class Comparing:
 
 
 @dataclass(frozen=True)
+class Glimpse:
+    """Rays of all views, view by view, and where a shape is along them."""
+
+    decoder: Decoder
+    prior: Prior
+    shape: Shape
+    sdf: Counted
+    view: Int[Tensor, "n"]
+    index: Int[Tensor, "n"]  # of the pixel
+    rays: Rays  # in the world
+    in_object: Rays
+    trace: Trace
+
+
+@dataclass(frozen=True)
 class Stage:
     """Photographs at one level of the pyramid."""
 
@@ -66,40 +81,54 @@ class Stage:
         return Stage(coarse, pictures, partners(cameras, config.partners), looks, meets, Consensus.of(cameras))
 
     @torch.no_grad()
-    def problem(
-        self,
-        decoder: Decoder,
-        prior: Prior,
-        shape: Shape,
-        config: Comparing,
-        random: torch.Generator,
-        labels: Labels | None = None,
-    ) -> tuple[PhotoProblem, Look]:
-        """Rays drawn anew, what their pixels show by `labels`, else by what is known so far, and who else sees it."""
-        view, index = self._drawn(config.rays, random)
-        rays = self._rays(view, index)
-        compared = self._read(view, index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
-        in_object, sdf = shape.place.rays_in_object(rays), Counted(decoder.field(prior.code(shape.w)))
+    def glimpse(self, decoder: Decoder, prior: Prior, shape: Shape, rays: int, random: torch.Generator) -> Glimpse:
+        """A shape along rays drawn anew, as many of each view."""
+        view, index = self._drawn(rays, random)
+        world = self._rays(view, index)
+        in_object, sdf = shape.place.rays_in_object(world), Counted(decoder.field(prior.code(shape.w)))
         trace = sphere_trace(sdf, in_object, meet_sphere(in_object), MARCH)
-        labels = labels or self._labels(view, index, trace.hit)
-        sure = self._read(view, index, [each[..., None] for each in labels])[:, 0]
-        far = ~trace.hit & (sdf(in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
+        return Glimpse(decoder, prior, shape, sdf, view, index, world, in_object, trace)
+
+    @torch.no_grad()
+    def problem(self, glimpse: Glimpse, config: Comparing, labels: Labels | None = None) -> tuple[PhotoProblem, Look]:
+        """What the glimpse's pixels show by `labels`, else as the shape has it, and who else sees that."""
+        shape, sdf, view, trace = glimpse.shape, glimpse.sdf, glimpse.view, glimpse.trace
+        compared = self._read(view, glimpse.index, [each.channels[:3].permute(1, 2, 0) for each in self.pictures])
+        labels = labels or self.labels(glimpse)
+        sure = self._read(view, glimpse.index, [each[..., None] for each in labels])[:, 0]
+        far = ~trace.hit & (sdf(glimpse.in_object.at(trace.closest.nan_to_num(posinf=0.0))) > WATCHED)
         kept = (trace.hit | (sure > 0) | (sure < 0) & ~far).nonzero()[:, 0]
-        seen = Sightings(rays, view, compared, sure)[kept]
-        view, in_object, trace = view[kept], in_object[kept], trace[kept]
+        seen = Sightings(glimpse.rays, view, compared, sure)[kept]
+        view, in_object, trace = view[kept], glimpse.in_object[kept], trace[kept]
         asked = (trace.hit & (seen.certainty >= 0)).nonzero()[:, 0]
         visible = self._visible(view[asked], shape.place, in_object[asked].at(trace.distance[asked]), sdf)
         pairs = torch.stack([asked[visible[0]], visible[1]], dim=1)
-        problem = PhotoProblem(decoder, prior, seen, self.pictures, pairs, config.weights, config.moves, shape.place)
+        problem = PhotoProblem(
+            glimpse.decoder, glimpse.prior, seen, self.pictures, pairs, config.weights, config.moves, shape.place
+        )
         problem.evaluations += sdf.evaluations
         return problem, problem.look(shape, Look(shape, trace.closest, trace.hit, trace.hit))
 
     @torch.no_grad()
-    def labels(self, sdf: SDF, place: Similarity, config: Comparing, random: torch.Generator) -> Labels:
-        """What the pixels of each view show, as a shape would have it."""
-        view, index = self._drawn(config.rays, random)
-        rays = place.rays_in_object(self._rays(view, index))
-        return self._labels(view, index, sphere_trace(sdf, rays, meet_sphere(rays), MARCH).hit)
+    def labels(self, glimpse: Glimpse) -> Labels:
+        """What the pixels of each view show, as a shape would have it.
+
+        By the masks where there are some, otherwise by appearance: that of hits against all others. What looks like
+        the object where most other views rule it out says nothing.
+        """
+        asked, hit = self._read(glimpse.view, glimpse.index, self.looks), glimpse.trace.hit
+        beyond = [looks.reshape(-1, 4)[~meets] for looks, meets in zip(self.looks, self.meets, strict=True)]
+        background = torch.cat([asked[~hit], *beyond])
+        is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
+        regions = Regions.of(torch.cat([asked[hit], background]), is_object)
+        images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
+        possible = self.consensus.agreed([image > 0 for image in images])
+        return [
+            image.masked_fill((image > 0) & ~shown | (image.abs() < DOUBT), 0.0)
+            if each.mask is None
+            else 2.0 * each.mask - 1
+            for each, image, shown in zip(self.photographs, images, possible, strict=True)
+        ]
 
     def _drawn(self, count: int, random: torch.Generator) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
         """As many pixels of each view, of those whose rays meet the unit sphere."""
@@ -121,22 +150,6 @@ class Stage:
         """What images have at pixels, view by view."""
         parts = [image.reshape(-1, image.shape[-1])[index[view == number]] for number, image in enumerate(images)]
         return torch.cat(parts)
-
-    def _labels(self, view: Int[Tensor, "n"], index: Int[Tensor, "n"], hit: Bool[Tensor, "n"]) -> Labels:
-        """By the masks where there are some, otherwise by appearance: that of hits against all others. What looks like
-        the object where most other views rule it out says nothing."""
-        asked, beyond = self._read(view, index, self.looks), zip(self.looks, self.meets, strict=True)
-        background = torch.cat([asked[~hit], *(looks.reshape(-1, 4)[~meets] for looks, meets in beyond)])
-        is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
-        regions = Regions.of(torch.cat([asked[hit], background]), is_object)
-        images = [2 * regions.smooth_probability(looks) - 1 for looks in self.looks]
-        possible = self.consensus.agreed([image > 0 for image in images])
-        return [
-            image.masked_fill((image > 0) & ~shown | (image.abs() < DOUBT), 0.0)
-            if each.mask is None
-            else 2.0 * each.mask - 1
-            for each, image, shown in zip(self.photographs, images, possible, strict=True)
-        ]
 
     def _visible(
         self, view: Int[Tensor, "n"], place: Similarity, points_object: Float[Tensor, "n 3"], sdf: SDF
