@@ -7,7 +7,6 @@ similarity are found together, from several starts.
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import islice
 
 import torch
@@ -88,41 +87,8 @@ def fit_photos(
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     device, place = prior.mean.device, place or Similarity.identity()
-    return _fitted(decoder, [each.to(device) for each in photographs], prior, config, place.to(device))
-
-
-def _fitted(
-    decoder: Decoder, photographs: Sequence[Photograph], prior: Prior, config: PhotoConfig, there: Similarity
-) -> Iterator[PhotoStep]:
-    stages = _pyramid(photographs, config)
-    if config.compared.moves:
-        for step in _approached(decoder, stages, prior, config, there):
-            yield step
-            there = step.place
-    began, search = time.perf_counter(), Search(decoder, prior, config.seed)
-    starts = [Shape(w, there) for w in search.starts(stages[0], config.compared, there, config.starts)]
-    compare = partial(_compared, decoder, stages[-1], prior, config)
-    steps = best_of(config, lambda start: _solved(decoder, stages, prior, config, start, starts[start]), compare)
-    yield from _charged(steps, search, time.perf_counter() - began)
-
-
-def _approached(
-    decoder: Decoder, stages: Sequence[Stage], prior: Prior, config: PhotoConfig, there: Similarity
-) -> Iterator[PhotoStep]:
-    """The mean shape's, which end where it lies: in a wrong place wrong training shapes fit best."""
-    began, search = time.perf_counter(), Search(decoder, prior, config.seed)
-    there = search.likelier(stages[0], config.compared, (there, search.told(stages[-1], there)))
-    shape, searched = Shape(prior.start(0, config.seed), there), time.perf_counter() - began
-    steps = _solved(decoder, stages, prior, config, APPROACH, shape)
-    yield from _charged(islice(steps, config.approach), search, searched)
-
-
-def _charged(steps: Iterator[PhotoStep], search: Search, seconds: float) -> Iterator[PhotoStep]:
-    """The first of them with what the search before has taken."""
-    step = next(steps)
-    evaluations = step.evaluations + search.evaluations
-    yield replace(step, seconds=step.seconds + seconds, evaluations=evaluations, searched=search.evaluations)
-    yield from steps
+    stages = _pyramid([each.to(device) for each in photographs], config)
+    return _Fit(decoder, prior, config, stages).steps(place.to(device))
 
 
 def _pyramid(photographs: Sequence[Photograph], config: PhotoConfig) -> list[Stage]:
@@ -131,36 +97,69 @@ def _pyramid(photographs: Sequence[Photograph], config: PhotoConfig) -> list[Sta
     return [kinds[level] for level in config.levels]
 
 
-def _solved(
-    decoder: Decoder, stages: Sequence[Stage], prior: Prior, config: PhotoConfig, start: int, shape: Shape
-) -> Iterator[PhotoStep]:
-    began, done, damping, expected = time.perf_counter(), 0, config.damping, shape.place
-    random = torch.Generator().manual_seed(config.seed)
-    for number, length in stages_of(config.iterations, len(stages)):
-        stage = stages[number]
-        glimpse = stage.glimpse(decoder, prior, shape, config.compared.rays, random)
-        problem, look = stage.problem(glimpse, config.compared)
-        problem.expected = expected
-        problem.scale, evaluations = max(config.scale * config.narrowing**number, config.narrowest), 0
-        solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
-        for found in minimise(problem.residuals, look, problem.moved, solver):
-            shape, damping, done = found.state.shape, found.damping, done + 1
-            terms = problem.terms(found.state, found.residuals)
-            seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
-            loss, code = sum(terms.values()), prior.code(shape.w)
-            yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, place=shape.place)
-            began = time.perf_counter()
+@dataclass(frozen=True)
+class _Fit:
+    """What all starts share."""
+
+    decoder: Decoder
+    prior: Prior
+    config: PhotoConfig
+    stages: Sequence[Stage]
+
+    def steps(self, place: Similarity) -> Iterator[PhotoStep]:
+        config = self.config
+        if config.compared.moves:
+            for step in self._approached(place):
+                yield step
+                place = step.place
+        began, search = time.perf_counter(), Search(self.decoder, self.prior, config.seed)
+        starts = [Shape(w, place) for w in search.starts(self.stages[0], config.compared, place, config.starts)]
+        steps = best_of(config, lambda start: self._solved(start, starts[start]), self._compared)
+        yield from _charged(steps, search, time.perf_counter() - began)
+
+    def _approached(self, place: Similarity) -> Iterator[PhotoStep]:
+        """The mean shape's, which end where it lies: in a wrong place wrong training shapes fit best."""
+        began, config = time.perf_counter(), self.config
+        search = Search(self.decoder, self.prior, config.seed)
+        place = search.likelier(self.stages[0], config.compared, (place, search.told(self.stages[-1], place)))
+        searched, mean = time.perf_counter() - began, Shape(self.prior.start(0, config.seed), place)
+        yield from _charged(islice(self._solved(APPROACH, mean), config.approach), search, searched)
+
+    def _solved(self, start: int, shape: Shape) -> Iterator[PhotoStep]:
+        config, prior = self.config, self.prior
+        began, done, damping, expected = time.perf_counter(), 0, config.damping, shape.place
+        random = torch.Generator().manual_seed(config.seed)
+        for number, length in stages_of(config.iterations, len(self.stages)):
+            stage = self.stages[number]
+            glimpse = stage.glimpse(self.decoder, prior, shape, config.compared.rays, random)
+            problem, look = stage.problem(glimpse, config.compared)
+            problem.expected = expected
+            problem.scale, evaluations = max(config.scale * config.narrowing**number, config.narrowest), 0
+            solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
+            for found in minimise(problem.residuals, look, problem.moved, solver):
+                shape, damping, done = found.state.shape, found.damping, done + 1
+                terms = problem.terms(found.state, found.residuals)
+                seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
+                loss, code = sum(terms.values()), prior.code(shape.w)
+                yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, place=shape.place)
+                began = time.perf_counter()
+
+    def _compared(self, trials: Sequence[Sequence[PhotoStep]]) -> list[PhotoStep]:
+        """Their ends, judged by what all of them together take for the object."""
+        began, ends = time.perf_counter(), [trial[-1] for trial in trials]
+        shapes = [Shape(self.prior.coordinates(end.code), end.place) for end in ends]
+        compared, seed = self.config.compared, self.config.seed
+        found = contradictions(self.stages[-1], self.decoder, self.prior, shapes, compared, seed)
+        seconds = (time.perf_counter() - began) / len(ends)
+        return [
+            replace(end, verdict=off, seconds=seconds, evaluations=evaluations)
+            for end, (off, evaluations) in zip(ends, found, strict=True)
+        ]
 
 
-def _compared(
-    decoder: Decoder, stage: Stage, prior: Prior, config: PhotoConfig, trials: Sequence[Sequence[PhotoStep]]
-) -> list[PhotoStep]:
-    """Their ends, judged by what all of them together take for the object."""
-    began, ends = time.perf_counter(), [trial[-1] for trial in trials]
-    shapes = [Shape(prior.coordinates(end.code), end.place) for end in ends]
-    found = contradictions(stage, decoder, prior, shapes, config.compared, config.seed)
-    seconds = (time.perf_counter() - began) / len(ends)
-    return [
-        replace(end, verdict=off, seconds=seconds, evaluations=evaluations)
-        for end, (off, evaluations) in zip(ends, found, strict=True)
-    ]
+def _charged(steps: Iterator[PhotoStep], search: Search, seconds: float) -> Iterator[PhotoStep]:
+    """The first of them with what the search before has taken."""
+    step = next(steps)
+    evaluations = step.evaluations + search.evaluations
+    yield replace(step, seconds=step.seconds + seconds, evaluations=evaluations, searched=search.evaluations)
+    yield from steps
