@@ -1,6 +1,7 @@
 """Commands on a device that is not the CPU: everything that meets is on one."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -22,7 +23,6 @@ from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.fit_samples import SampleFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of
 from distrace.pages import views_page
-from distrace.photographs.fit_photos import PhotoConfig
 from distrace.render import render
 from distrace.training.train import TrainConfig
 
@@ -128,6 +128,7 @@ def test_photographs_are_brought_to_the_model(
     for name in ("SHOWN", "FRAMES"):
         monkeypatch.setattr(views_page, name, 1)
     for name in ("KNOWN_PLACE", "UNKNOWN_PLACE"):
-        monkeypatch.setattr(multiview, name, PhotoConfig(iterations=3, trial=1, approach=1, levels=(0.5, 1.0)))
+        short = replace(getattr(multiview, name), iterations=3, trial=1, approach=1, levels=(0.5, 1.0))
+        monkeypatch.setattr(multiview, name, short)
     command("multiview", model, photographs, *more, "--starts", 2, "--rays", 200, "--resolution", 16)
     assert (tmp_path / "out" / "result.json").exists()

@@ -2,6 +2,7 @@
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,7 @@ from distrace.evaluation.multiview_table import (
     settings_of,
     surface_of,
 )
-from distrace.photographs.fit_photos import PhotoConfig
+from distrace.photographs.fit_photos import KNOWN_PLACE
 from distrace.pose import Similarity
 from distrace.render import render
 from distrace.shading import error_picture
@@ -57,7 +58,7 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_views(tmp_path / "views", ring(6, 40))
-    monkeypatch.setattr("distrace.cli.multiview.KNOWN_PLACE", PhotoConfig(iterations=2, levels=(0.5, 1.0)))
+    monkeypatch.setattr("distrace.cli.multiview.KNOWN_PLACE", replace(KNOWN_PLACE, iterations=2, levels=(0.5, 1.0)))
     for name in ("SHOWN", "FRAMES"):
         monkeypatch.setattr(f"distrace.pages.views_page.{name}", 2)
     out = tmp_path / "out"

@@ -96,7 +96,7 @@ def _fitted(task: Task) -> list[Step]:
     with progress("fitting", task.fit.total) as bar:
         for step in completing(task.model, task.known, task.fit):
             steps.append(step)
-            bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}")
+            bar.advance(f"{step.name}, loss {step.loss:.4f}")
     return steps
 
 
@@ -127,7 +127,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
         distinct.setdefault((step.start, step.iteration), step)  # the result is given again
     losses: dict[str, list[float]] = {}
     for step in distinct.values():
-        name = "outline" if "outline" in step.terms else f"start {step.start + 1}"
+        name = "outline" if "outline" in step.terms else step.name
         losses.setdefault(name, []).append(step.loss)
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, last.code)
@@ -156,7 +156,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
         truth_points=truth.vertices if isinstance(truth, trimesh.Trimesh) else truth,
         chamfer=outcome.chamfer,
         facts=facts,
-        chosen=f"start {outcome.steps[-1].start + 1}",
+        chosen=outcome.steps[-1].name,
     )
 
 

@@ -52,8 +52,8 @@ class Multiview:
             raise ValueError(f"--size {self.size} was given; at least 8 pixels are needed")
         views = [view.at_most(self.size).to(run.device) for view in found.views]
         views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
-        compared = Comparing(rays=self.rays, moves=not self.fixed, same_light=not self.changing_light)
         usual = KNOWN_PLACE if self.fixed else UNKNOWN_PLACE
+        compared = replace(usual.compared, rays=self.rays, same_light=not self.changing_light)
         config = replace(usual, starts=self.starts, seed=self.seed, compared=compared)
         steps = _fitted(model, views, config)
         last, prior = steps[-1], prior_of(model.codes)

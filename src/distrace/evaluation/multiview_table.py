@@ -167,7 +167,7 @@ def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[
         stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
         best = Search(model.decoder, prior).ranked(stage, KNOWN_PLACE.compared, still)[0]
         return prior.code(best[1]), still
-    moved = trial.method != "ours"
+    moved = "moved" in trial.method
     config, place = (UNKNOWN_PLACE, disturbed(hash_of(clip["shape"]))) if moved else (KNOWN_PLACE, still)
     *_, last = fit_photos(model.decoder, views, prior, config, place)
     return last.code, last.place

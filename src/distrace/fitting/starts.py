@@ -61,6 +61,11 @@ class Step:
     evaluations: int = 0  # of the field
     verdict: float = inf  # how much it contradicts what was seen, where a judge was asked
 
+    @property
+    def name(self) -> str:
+        """Of what it is a step."""
+        return f"start {self.start + 1}"
+
 
 def stages_of(iterations: int, count: int) -> list[tuple[int, int]]:
     """The numbers of stages, and how many of the iterations each has; those that would have none are left out."""

@@ -66,15 +66,14 @@ class PhotoStep(Step):
 
     @property
     def name(self) -> str:
-        """Of what it is a step."""
-        return "approach" if self.start == APPROACH else f"start {self.start + 1}"
+        return "approach" if self.start == APPROACH else super().name
 
 
 def fit_photos(
     decoder: Decoder,
     photographs: Sequence[Photograph],
     prior: Prior,
-    config: PhotoConfig = PhotoConfig(),
+    config: PhotoConfig = UNKNOWN_PLACE,
     place: Similarity | None = None,
 ) -> Iterator[PhotoStep]:
     """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
