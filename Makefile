@@ -6,8 +6,8 @@ BIN := .venv/bin
 demo: .venv/installed
 	$(BIN)/distrace demo --out out/demo
 
-test: .venv/installed
-	$(BIN)/python -m pytest -n 2
+test: .venv/installed  ## each file in one process: what its tests share is made once
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: .venv/installed  ## style and types
 	$(BIN)/ruff check src tests examples

@@ -2,11 +2,10 @@
 
 import pytest
 import torch
+from photographed import ball
 from test_fit_photos import ring
 
 from distrace.photographs.consensus import Consensus
-from distrace.primitives import sphere
-from distrace.render import render
 
 SIZE = 48
 CAMERAS = ring(size=SIZE)
@@ -15,7 +14,7 @@ CONSENSUS = Consensus.of(CAMERAS)
 
 @pytest.fixture(scope="module")
 def masks() -> list[torch.Tensor]:
-    return [render(sphere(0.4), camera).mask for camera in CAMERAS]
+    return [ball(camera, 0.4) for camera in CAMERAS]
 
 
 def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept(masks: list[torch.Tensor]) -> None:

@@ -102,9 +102,9 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
 
 @pytest.fixture
 def photographs(model: Path, tmp_path: Path) -> Path:
-    """Three of a sphere, of which the first has a mask."""
+    """Two of a sphere, of which the first has a mask."""
     views = []
-    for k in range(3):
+    for k in range(2):
         camera = Camera.orbit(25 * k, 20, 3, height=24, width=24, focal_px=30.0)
         with torch.no_grad():
             seen = render(load_model(model).field(1), camera)
@@ -125,8 +125,8 @@ def test_photographs_are_brought_to_the_model(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for name in ("SHOWN", "FRAMES"):
-        monkeypatch.setattr(views_page, name, 1)
+    for name, little in (("SHOWN", 1), ("FRAMES", 1), ("SIZE", 24)):
+        monkeypatch.setattr(views_page, name, little)
     for name in ("KNOWN_PLACE", "UNKNOWN_PLACE"):
         short = replace(getattr(multiview, name), iterations=3, trial=1, approach=1, levels=(0.5, 1.0))
         monkeypatch.setattr(multiview, name, short)

@@ -54,6 +54,7 @@ def everything(view: View) -> Targets:
     return Pool.of(view).draw(10**6, 10**6, torch.Generator().manual_seed(0))
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> None:
     view = view_of(TRUE).sparse(100)
     step = last(fit_shape(Spheres(), [view], PRIOR, CONFIG))

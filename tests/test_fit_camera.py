@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from photographed import EXACT
 from torch import Tensor
 
 from distrace import primitives
@@ -34,7 +35,7 @@ def shape(points: Tensor) -> Tensor:
 def view(sdf: SDF = shape, size: int = 64, dtype: torch.dtype = f64) -> View:
     camera = Camera.orbit(40, 25, 4.5, height=size, width=size, dtype=dtype)
     with torch.no_grad():
-        buffers = render(sdf, camera)
+        buffers = render(sdf, camera, config=EXACT)
     return View(camera, buffers.depth, buffers.mask, buffers.normal)
 
 
@@ -134,6 +135,7 @@ def _rendered(sight: Sight, observed: View) -> Tensor:
     return depth
 
 
+@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kept", [("depth",), ("mask",), ("depth", "mask", "normal")], ids=str)
 def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
     observed = view(dtype=torch.float32)
@@ -169,6 +171,7 @@ def test_a_camera_that_looks_away_is_turned_to_the_object() -> None:
     assert pose_error(found(observed, away), observed.camera)[0] < 0.5
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_a_focal_length_is_found_with_the_pose() -> None:
     observed = view(dtype=torch.float32)
     start = zoomed(turned(observed.camera, 8), torch.tensor(1.2).log())
@@ -179,6 +182,7 @@ def test_a_focal_length_is_found_with_the_pose() -> None:
     torch.testing.assert_close(kept.intrinsics, start.intrinsics)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_outliers_among_the_depths_hardly_matter() -> None:
     observed = view(dtype=torch.float32)
     depth, random = observed.depth.clone(), torch.Generator().manual_seed(0)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from photographed import EXACT
 from test_fit_photos import ring
 from torch.nn import functional as F
 
@@ -14,9 +15,7 @@ from distrace.primitives import sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruction.matching import ACROSS, Matching, correlation
 from distrace.render import render
-from distrace.trace import TraceConfig, sphere_trace
-
-EXACT = TraceConfig(coarse_levels=0, tolerance=1e-5, steps=200)
+from distrace.trace import sphere_trace
 
 
 def stripes(points: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
@@ -28,7 +27,7 @@ def photographs(size: int = 120) -> list[Photograph]:
     found = []
     for number, camera in enumerate(ring(16, size)):
         with torch.no_grad():
-            buffers = render(sphere(0.5), camera)
+            buffers = render(sphere(0.5), camera, config=EXACT)
             image = shade(buffers, stripes, torch.zeros(3))
         found.append(Photograph(f"{number:02}", camera, image, buffers.mask))
     return found

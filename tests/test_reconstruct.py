@@ -15,6 +15,7 @@ import roma
 import torch
 import trimesh
 from bumpy import bumpy_balls
+from photographed import EXACT
 from test_fit_photos import TRUE, paint, ring
 from torch.nn import functional as F
 
@@ -78,7 +79,7 @@ def views(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Ph
     field, made = bumpy_balls().field(TRUE), []
     for number, camera in enumerate(ring(8, 40)):
         with torch.no_grad(), without_checks():
-            buffers = render(field, camera)
+            buffers = render(field, camera, config=EXACT)
             made.append(Photograph(f"{number:02}", camera, shade(buffers, paint, BLACK), buffers.mask))
     return made
 
@@ -236,11 +237,7 @@ def coarse_hull(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("coarse_hull")
 def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photograph]) -> None:
     cameras = [view.camera.resized(3.0) for view in views]
-    ball = [
-        Photograph(view.name, camera, torch.ones(camera.height, camera.width, 3), render(sphere(0.5), camera).mask)
-        for view, camera in zip(views, cameras, strict=True)
-    ]
-    hull = visual_hull(ball)
+    hull = visual_hull(seen_by(sphere(0.5), cameras))
     directions = F.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     directions[:, 1] *= 0.3  # the cameras see it from the side
     directions = F.normalize(directions, dim=-1)
@@ -261,7 +258,7 @@ def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
 
 def seen_by(sdf: SDF, cameras: Sequence[Camera]) -> list[Photograph]:
     with torch.no_grad():
-        masks = [render(sdf, camera).mask for camera in cameras]
+        masks = [render(sdf, camera, config=EXACT).mask for camera in cameras]
     images = [torch.ones(*mask.shape, 3) for mask in masks]
     return [Photograph(f"{number:02}", *parts) for number, parts in enumerate(zip(cameras, images, masks, strict=True))]
 
@@ -376,7 +373,8 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     views: list[Photograph], tmp_path: Path, run: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("distrace.cli.reconstruct.ReconstructConfig", partial(ReconstructConfig, beginning=150))
-    monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 3)
+    monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 2)
+    monkeypatch.setattr("distrace.cli.reconstructed.TOLD", 1)
     monkeypatch.setattr("distrace.reconstruction.registration.STEPS", 5)
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from photographed import EXACT
 from torch import Tensor
 
 from distrace.camera import Camera
@@ -34,7 +35,7 @@ def photographed(sdf: SDF, cameras: list[Camera]) -> list[Photograph]:
     found = []
     for number, camera in enumerate(cameras):
         with torch.no_grad():
-            buffers = render(sdf, camera)
+            buffers = render(sdf, camera, config=EXACT)
         points = camera.rays().at(buffers.depth / camera.cosines())
         image = torch.where(buffers.mask[..., None], painted(points), 0.0)
         found.append(Photograph(f"{number:02}", camera, image, buffers.mask))

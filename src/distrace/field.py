@@ -1,5 +1,6 @@
 """What a surface is: a callable from points to signed distances, and wrappers that turn one field into another."""
 
+import reprlib
 from collections.abc import Callable
 
 import torch
@@ -17,7 +18,7 @@ def asked(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"
     """
     values = sdf(points)
     if not isinstance(values, Tensor) or values.shape != points.shape[:-1] or values.dtype != points.dtype:
-        given = f"{values.dtype} of shape {list(values.shape)}" if isinstance(values, Tensor) else repr(values)
+        given = f"{values.dtype} of shape {list(values.shape)}" if isinstance(values, Tensor) else reprlib.repr(values)
         raise ValueError(
             f"the field gave {given} at points of shape {list(points.shape)}; one distance for each is needed,"
             f" {points.dtype} of shape {list(points.shape[:-1])}"
