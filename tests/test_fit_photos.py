@@ -8,7 +8,6 @@ from math import inf
 import pytest
 import torch
 from bumpy import bumpy_balls
-from photographed import EXACT
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -54,8 +53,7 @@ def paint(points: Tensor, normals: Tensor, directions: Tensor) -> Tensor:
 def photographs(decoder: Decoder, cameras: Sequence[Camera], place: Similarity | None = None) -> list[Photograph]:
     """Of the true shape, painted in its own frame."""
     place = place or Similarity.identity()
-    seen = [render(decoder.field(TRUE), place.camera_in_object(camera), config=EXACT) for camera in cameras]
-    images = [shade(buffers, paint, GREY) for buffers in seen]
+    images = [shade(render(decoder.field(TRUE), place.camera_in_object(camera)), paint, GREY) for camera in cameras]
     return [Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))]
 
 
@@ -73,7 +71,7 @@ def views(decoder: Decoder, without_checks: Callable[[], AbstractContextManager[
 @torch.no_grad()
 def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> float:
     """Root mean square, over the surface of the true shape in its place, of the field of another in its own."""
-    points = torch.cat([render(decoder.field(TRUE), camera, config=EXACT).points for camera in ring(6, 24)])
+    points = torch.cat([render(decoder.field(TRUE), camera).points for camera in ring(6, 24)])
     world = (place or Similarity.identity()).to_world(points)
     there = shape.place.to_object(world)
     return float(decoder.field(PRIOR.code(shape.w))(there).square().mean().sqrt())

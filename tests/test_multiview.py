@@ -10,7 +10,6 @@ import pytest
 import torch
 import trimesh
 from bumpy import bumpy_balls
-from photographed import EXACT
 from test_fit_photos import GREY, TRUE, paint, ring
 
 from distrace.boundary import shade
@@ -47,7 +46,7 @@ def model(tmp_path: Path) -> Path:
 @torch.no_grad()
 def save_views(folder: Path, cameras: list[Camera]) -> None:
     field = bumpy_balls().field(TRUE)
-    images = [shade(render(field, camera, config=EXACT), paint, GREY) for camera in cameras]
+    images = [shade(render(field, camera), paint, GREY) for camera in cameras]
     views = [
         Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]

@@ -79,7 +79,7 @@ def views(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Ph
     field, made = bumpy_balls().field(TRUE), []
     for number, camera in enumerate(ring(8, 40)):
         with torch.no_grad(), without_checks():
-            buffers = render(field, camera, config=EXACT)
+            buffers = render(field, camera)
             made.append(Photograph(f"{number:02}", camera, shade(buffers, paint, BLACK), buffers.mask))
     return made
 
