@@ -102,9 +102,9 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
 
 @pytest.fixture
 def photographs(model: Path, tmp_path: Path) -> Path:
-    """Two of a sphere, of which the first has a mask."""
+    """Three of a sphere, of which the first has a mask."""
     views = []
-    for k in range(2):
+    for k in range(3):
         camera = Camera.orbit(25 * k, 20, 3, height=24, width=24, focal_px=30.0)
         with torch.no_grad():
             seen = render(load_model(model).field(1), camera)

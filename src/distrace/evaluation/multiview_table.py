@@ -32,7 +32,7 @@ from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
-from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, fit_photos
+from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
 from distrace.photographs.search import Search
 from distrace.photographs.stage import Stage
 from distrace.pose import Similarity
@@ -153,22 +153,26 @@ def settings_of(method: str) -> object:
     if method not in METHODS:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS)}")
     own = {"silhouettes": CodeFitConfig(), "stereo": None}
-    return own.get(method, (method, UNKNOWN_PLACE if "moved" in method else KNOWN_PLACE, MOVED_BY))
+    return own.get(method, (method, _config(method), MOVED_BY))
+
+
+def _config(method: str) -> PhotoConfig:
+    """How a method looks at photographs."""
+    return UNKNOWN_PLACE if "moved" in method else KNOWN_PLACE
 
 
 def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], Similarity]:
     """The code, and the place."""
-    prior, still = prior_of(model.codes), Similarity.identity()
+    prior, still, config = prior_of(model.codes), Similarity.identity(), _config(trial.method)
     views = list(load_photographs(trial.folder).views)
     if trial.method == "silhouettes":
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
         return step.code, still
     if trial.method == "nearest":
-        stage = Stage.of(views, KNOWN_PLACE.levels[0], KNOWN_PLACE.compared)
-        best = Search(model.decoder, prior).ranked(stage, KNOWN_PLACE.compared, still)[0]
+        stage = Stage.of(views, config.levels[0], config.compared)
+        best = Search(model.decoder, prior).ranked(stage, config.compared, still)[0]
         return prior.code(best[1]), still
-    moved = "moved" in trial.method
-    config, place = (UNKNOWN_PLACE, disturbed(hash_of(clip["shape"]))) if moved else (KNOWN_PLACE, still)
+    place = disturbed(hash_of(clip["shape"])) if config.compared.moves else still
     *_, last = fit_photos(model.decoder, views, prior, config, place)
     return last.code, last.place
 
