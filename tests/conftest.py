@@ -1,8 +1,10 @@
-"""One thread, few examples; and where the contract says 30, an annotated `float` takes it."""
+"""One thread, few examples, types checked in a test's first calls; where the contract says 30, a `float` takes it."""
 
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
-from functools import cache
+from collections import Counter
+from collections.abc import Callable
+from functools import cache, partial, wraps
+from types import FunctionType
+from typing import Any
 
 import beartype
 import jaxtyping
@@ -11,12 +13,41 @@ import pytest
 import torch
 from hypothesis import settings
 
+CHECKED = (
+    20  # calls of each function in a test and what is set up for it: all of them would be half of a long one's time
+)
+
 torch.set_num_threads(1)
 settings.register_profile("light", deadline=None, max_examples=12, derandomize=True)
 settings.load_profile("light")
 
 _checked = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))  # PEP 484 lets an int pass for a float
+_jaxtyped = jaxtyping.jaxtyped
 _kept: dict[tuple, Callable] = {}
+_calls: Counter[object] = Counter()
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    _calls.clear()
+
+
+def _at_first(function: Any = None, *, typechecker: Any) -> Any:
+    """A function, or a class, whose types are checked, a function's CHECKED times in each test."""
+    if function is None:
+        return partial(_at_first, typechecker=typechecker)
+    if not isinstance(function, FunctionType):
+        return _jaxtyped(function, typechecker=typechecker)
+    code = function.__code__  # a function within another is made anew in each call of that
+    if _calls[code] >= CHECKED:
+        return function
+    checked = _jaxtyped(function, typechecker=typechecker)
+
+    @wraps(checked)
+    def called(*args: Any, **named: Any) -> Any:
+        _calls[code] += 1
+        return (checked if _calls[code] <= CHECKED else function)(*args, **named)
+
+    return called
 
 
 def _check(stub: Callable) -> Callable:
@@ -29,27 +60,7 @@ def _check(stub: Callable) -> Callable:
     return _kept[key]
 
 
-beartype.beartype = _check  # the import hook looks this name up when it checks a module
+# The import hook looks these names up when it checks a module.
+jaxtyping.jaxtyped = _at_first
+beartype.beartype = _check
 jaxtyping._array_types._make_array = cache(jaxtyping._array_types._make_array)  # so that equal annotations are equal
-
-
-@contextmanager
-def _without_checks() -> Iterator[None]:
-    jaxtyping.config.update("jaxtyping_disable", True)
-    try:
-        yield
-    finally:
-        jaxtyping.config.update("jaxtyping_disable", False)
-
-
-@pytest.fixture
-def unchecked() -> Iterator[None]:
-    """Without the checks of shapes and types, half of a long test's time; for those whose parts other tests check."""
-    with _without_checks():
-        yield
-
-
-@pytest.fixture(scope="session")
-def without_checks() -> Callable[[], AbstractContextManager[None]]:
-    """The same within a fixture of a module, of what would be set up before `unchecked`."""
-    return _without_checks

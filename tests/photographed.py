@@ -1,5 +1,6 @@
 """Small folders of photographs for tests: cameras around an object, in a world of its own, and what they saw."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,9 +9,12 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photographs import Photograph, Placement, load_photographs
+from distrace.primitives import sphere
 from distrace.rays import meet_sphere
+from distrace.render import render
 from distrace.trace import TraceConfig
 
 EXACT = TraceConfig(coarse_levels=0, tolerance=1e-5, steps=200)  # of few pixels several times as fast as `fast`
@@ -49,6 +53,22 @@ def photographs(masks: bool = True) -> list[Photograph]:
         image = torch.from_numpy(colours(camera, k).astype(np.float32) / 255)
         views.append(Photograph(f"view{k}", camera, image, ball(camera) if masks else None))
     return views
+
+
+def stripes(points: Tensor) -> Tensor:
+    waves = (points @ torch.tensor([[19.0, 4, 2], [2, 16, 6], [4, 2, 14]]).to(points)).sin()
+    return 0.5 + 0.4 * waves
+
+
+@torch.no_grad()
+def striped_ball(cameras: Sequence[Camera], finer: float = 1.0) -> list[Photograph]:
+    """A ball of radius 0.5, painted, and its masks."""
+    found = []
+    for number, camera in enumerate(cameras):
+        buffers = render(sphere(0.5), camera, config=EXACT)
+        image = shade(buffers, lambda points, *_: stripes(finer * points), torch.zeros(3))
+        found.append(Photograph(f"{number:02}", camera, image, buffers.mask))
+    return found
 
 
 def write_images(folder: Path, suffix: str = ".png") -> None:

@@ -110,7 +110,6 @@ def test_naive_is_a_sample_of_rays_each_for_all_of_its_steps(table: dict[str, tu
     assert row.hits == pytest.approx(table["parallel"][0].hits, rel=0.3)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_queries_are_all_that_the_field_was_asked_for() -> None:
     counted = Counted(SOFA)
     for case in of_field(counted, poster_view(24)):
@@ -134,7 +133,6 @@ class Spheres(Decoder):
         return points.norm(dim=-1) - code[..., 0]
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() -> None:
     spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 1.0]]), ("ball",))
     rows = {row.strategy: row for row, _ in measure(of_model(spheres, 0, poster_view(48)), repeats=1)}

@@ -32,7 +32,6 @@ def test_at_the_true_camera_little_is_apart() -> None:
     assert here.loss(100.0) < 0.05 * images.residuals(turned(observed.camera, 15)).loss(100.0)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_from_afar_it_leads_near() -> None:
     observed = only(view(dtype=torch.float32), "normal")
     images = Blurred.of(Still.of(shape, observed.camera.intrinsics), observed, 2.0)

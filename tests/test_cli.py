@@ -424,7 +424,6 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
     assert Image.open(out / "filmstrip.png").width > 100
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:

@@ -72,7 +72,6 @@ def test_what_is_rendered_is_on_one_device(words: str, model: Path, command: Com
     assert (tmp_path / "out" / "result.json").exists()
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_what_is_fitted_is_on_the_models_device(
     model: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -85,7 +84,6 @@ def test_what_is_fitted_is_on_the_models_device(
         assert (tmp_path / "out" / "result.json").exists()
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("method", [*METHODS, *CLOUDS])
 def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     camera = Camera.orbit(30, 20, 2.5, height=16, width=16, focal_px=16.0)
@@ -115,7 +113,6 @@ def photographs(model: Path, tmp_path: Path) -> Path:
     return tmp_path / "views"
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("more", [(), ("--changing-light", "--fixed")])
 def test_photographs_are_brought_to_the_model(
     more: tuple[str, ...],

@@ -54,7 +54,6 @@ def everything(view: View) -> Targets:
     return Pool.of(view).draw(10**6, 10**6, torch.Generator().manual_seed(0))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> None:
     view = view_of(TRUE).sparse(100)
     step = last(fit_shape(Spheres(), [view], PRIOR, CONFIG))
@@ -63,7 +62,6 @@ def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> Non
     assert step.evaluations > 0
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_two_views_recover_it_too_and_normals_help() -> None:
     other = Camera.orbit(120, -10, 2.5, height=40, width=40, focal_px=40.0)
     views = [view_of(TRUE, normal=True).sparse(30), view_of(TRUE, other, normal=True).sparse(30)]
@@ -72,7 +70,6 @@ def test_two_views_recover_it_too_and_normals_help() -> None:
     torch.testing.assert_close(step.code, TRUE, atol=0.01, rtol=0)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     """One depth fits spheres of every radius; only the mask knows which.
 
@@ -92,7 +89,6 @@ def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     torch.testing.assert_close(fitted.code, TRUE, atol=0.01, rtol=0)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_from_where_nothing_is_hit_the_clearance_leads_back() -> None:
     aside = torch.tensor([0.15, -0.45, -0.3, 0.3])
     prior = Prior(aside, torch.diag(torch.tensor([0.1, 0.3, 0.3, 0.3])))
@@ -154,7 +150,6 @@ def test_a_view_from_inside_the_mean_shape_is_refused() -> None:
         next(fit_shape(Spheres(), [view_of(TRUE), View(inside, torch.full((8, 8), 0.3))], PRIOR, CONFIG))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_normals_alone_tell_where_a_sphere_is() -> None:
     view = view_of(TRUE, mask=False, normal=True)
     known = replace(view, depth=torch.full_like(view.depth, torch.inf))

@@ -135,7 +135,6 @@ def _rendered(sight: Sight, observed: View) -> Tensor:
     return depth
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("kept", [("depth",), ("mask",), ("depth", "mask", "normal")], ids=str)
 def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
     observed = view(dtype=torch.float32)
@@ -145,14 +144,12 @@ def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
     assert percent < limit
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_from_normals_alone_the_orientation_is_found() -> None:
     observed = view(dtype=torch.float32)
     degrees, _ = pose_error(found(only(observed, "normal"), turned(observed.camera, 10)), observed.camera)
     assert degrees < 0.5
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_where_one_start_leads_nowhere_another_does() -> None:
     observed = view(dtype=torch.float32)
     start = turned(observed.camera, 70)
@@ -164,14 +161,12 @@ def test_where_one_start_leads_nowhere_another_does() -> None:
     assert pose_error(alone[-1].camera, observed.camera)[0] > 5
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_camera_that_looks_away_is_turned_to_the_object() -> None:
     observed = view(dtype=torch.float32)
     away = turned_object(observed.camera, torch.zeros(3), torch.tensor([0, 6.0, 0]))
     assert pose_error(found(observed, away), observed.camera)[0] < 0.5
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_focal_length_is_found_with_the_pose() -> None:
     observed = view(dtype=torch.float32)
     start = zoomed(turned(observed.camera, 8), torch.tensor(1.2).log())
@@ -182,7 +177,6 @@ def test_a_focal_length_is_found_with_the_pose() -> None:
     torch.testing.assert_close(kept.intrinsics, start.intrinsics)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_outliers_among_the_depths_hardly_matter() -> None:
     observed = view(dtype=torch.float32)
     depth, random = observed.depth.clone(), torch.Generator().manual_seed(0)

@@ -136,7 +136,6 @@ def test_continuing_from_the_last_hits_finds_what_a_whole_march_finds(decoder: D
     assert between - before < problem.evaluations - between, "at fewer evaluations"
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_the_best_end_is_brought_to_the_outline() -> None:
     """Of a silhouette alone: a few rays through pixels tell roughly where it is, rays between them exactly."""
     decoder = bumpy_balls(0.4)  # all of it is in the unit sphere: its outline is that of its surface

@@ -1,7 +1,6 @@
 """Shapes from photographs, with an untrained decoder whose shapes are bumpy balls, painted."""
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
 
@@ -63,9 +62,8 @@ def decoder() -> Decoder:
 
 
 @pytest.fixture(scope="module")
-def views(decoder: Decoder, without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
-    with without_checks():
-        return photographs(decoder, ring())
+def views(decoder: Decoder) -> list[Photograph]:
+    return photographs(decoder, ring())
 
 
 @torch.no_grad()
@@ -195,12 +193,10 @@ def changed(problem: PhotoProblem, shape: Shape, step: Tensor) -> tuple:
     return problem.residuals(look), look.wrong
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_code_and_a_place_are_found_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, starts = list[Similarity](), Search.starts
 
@@ -243,7 +239,6 @@ def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) ->
         fit_photos(decoder, views[:1], PRIOR)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_all_evaluations_are_counted(
     decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
 ) -> None:

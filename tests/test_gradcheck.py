@@ -200,7 +200,6 @@ def test_of_a_decoder_code_and_weights_are_checked() -> None:
             assert rows[quantity, parameter].pixels > 10
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_decoder_s_field_knows_its_code_and_the_decoder_stays_as_it_was() -> None:
     decoder = small_decoder()
     own = check_gradients(decoder.field(0.1 * torch.ones(4)), CAMERA, size=8)

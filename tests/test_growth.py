@@ -19,7 +19,6 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "VIEWS", (1, 3))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_row_for_every_size_strategy_network_and_number_of_views() -> None:
     rows = [*growth.by_size(sphere(0.5), 1), *growth.by_network(1), *growth.by_views(sphere(0.5), 1)]
     assert [row.value for row in rows] == ["16", "16", "32", "32", "2 × 16", "2 × 16", "3 × 16", "3 × 16", "1", "3"]

@@ -4,33 +4,16 @@ from dataclasses import replace
 
 import pytest
 import torch
-from photographed import EXACT
+from photographed import EXACT, striped_ball
 from test_fit_photos import ring
 from torch.nn import functional as F
 
-from distrace.boundary import shade
 from distrace.data.photograph import Photograph
 from distrace.fitting.targets import band
 from distrace.primitives import sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruction.matching import ACROSS, Matching, correlation
-from distrace.render import render
 from distrace.trace import sphere_trace
-
-
-def stripes(points: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-    waves = (points @ torch.tensor([[19.0, 4, 2], [2, 16, 6], [4, 2, 14]]).to(points)).sin()
-    return 0.5 + 0.4 * waves
-
-
-def photographs(size: int = 120) -> list[Photograph]:
-    found = []
-    for number, camera in enumerate(ring(16, size)):
-        with torch.no_grad():
-            buffers = render(sphere(0.5), camera, config=EXACT)
-            image = shade(buffers, stripes, torch.zeros(3))
-        found.append(Photograph(f"{number:02}", camera, image, buffers.mask))
-    return found
 
 
 def rays_of(views: list[Photograph], every: int = 97) -> tuple[torch.Tensor, torch.Tensor, Rays]:
@@ -54,7 +37,7 @@ def term(matching: Matching, views: list[Photograph], radius: float) -> float:
 
 
 def test_the_true_surface_agrees_best() -> None:
-    views = photographs()
+    views = striped_ball(ring(16, 120))
     matching = Matching.of(views, torch.device("cpu"))
     true = term(matching, views, 0.5)
     assert true < 0.01
@@ -63,14 +46,14 @@ def test_the_true_surface_agrees_best() -> None:
 
 
 def test_images_may_differ_in_size_and_light() -> None:
-    views = photographs()
+    views = striped_ball(ring(16, 120))
     small = views[3].resized(0.5)
     views[3] = replace(small, image=0.3 * small.image + 0.1)
     assert term(Matching.of(views, torch.device("cpu")), views, 0.5) < 0.03
 
 
 def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
-    views = photographs(40)
+    views = striped_ball(ring(16, 40))
     matching = Matching.of(views, torch.device("cpu"))
     doubled = Matching(*(x.double() if x.is_floating_point() else x for x in vars(matching).values()))
     view, places, rays = rays_of(views, 61)
@@ -96,7 +79,7 @@ def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
 
 
 def test_what_faces_away_is_not_compared() -> None:
-    views = photographs()
+    views = striped_ball(ring(16, 120))
     matching = Matching.of(views, torch.device("cpu"))
     view, places, rays = rays_of(views)
     points = rays.at(torch.full_like(rays.origins[:, 0], 2.0))

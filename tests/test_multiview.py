@@ -53,7 +53,6 @@ def save_views(folder: Path, cameras: list[Camera]) -> None:
     save_photographs(folder, Photographs(tuple(views), Placement(torch.tensor([3.0, 0, 0]).double(), 2.0), "ours"))
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

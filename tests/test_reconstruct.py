@@ -3,7 +3,6 @@
 import json
 import math
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
 from copy import deepcopy
 from dataclasses import replace
 from functools import partial
@@ -75,20 +74,19 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
 
 
 @pytest.fixture(scope="module")
-def views(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
+def views() -> list[Photograph]:
     field, made = bumpy_balls().field(TRUE), []
     for number, camera in enumerate(ring(8, 40)):
-        with torch.no_grad(), without_checks():
+        with torch.no_grad():
             buffers = render(field, camera)
             made.append(Photograph(f"{number:02}", camera, shade(buffers, paint, BLACK), buffers.mask))
     return made
 
 
 @pytest.fixture(scope="module")
-def fitted(views: list[Photograph], without_checks: Callable[[], AbstractContextManager[None]]) -> Reconstruction:
+def fitted(views: list[Photograph]) -> Reconstruction:
     state = Reconstruction.fresh(SMALL, SHORT, 7, CPU)
-    with without_checks():
-        list(reconstruct(views[1:], state, SHORT))
+    list(reconstruct(views[1:], state, SHORT))
     return state
 
 
@@ -198,7 +196,6 @@ def test_a_camera_between_two_moves_as_they_do() -> None:
     torch.testing.assert_close(between(steps[:1], eyes[:1], eyes[2]), steps[0])
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_disturbed_camera_is_found_again(views: list[Photograph], fitted: Reconstruction) -> None:
     off = moved(views[0], motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
     found = registered(fitted, off, SHORT)
@@ -278,7 +275,7 @@ def test_a_view_whose_camera_is_turned_is_named() -> None:
     assert [view.name for view in found if view.doubtful] == ["02"]
 
 
-@pytest.mark.usefixtures("unchecked", "coarse_hull")
+@pytest.mark.usefixtures("coarse_hull")
 def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
     above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
@@ -368,7 +365,7 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
             parted(views, every)
 
 
-@pytest.mark.usefixtures("unchecked", "coarse_hull")
+@pytest.mark.usefixtures("coarse_hull")
 def test_the_command_writes_a_mesh_in_the_folders_world(
     views: list[Photograph], tmp_path: Path, run: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -13,8 +13,8 @@ import trimesh
 
 from distrace import primitives
 from distrace.data import sampling
-from distrace.data.samples import Doubt, doubt, lost, sample, write_samples
-from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid
+from distrace.data.samples import THIN, Doubt, doubt, lost, sample, write_samples
+from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, normalised_frame
 from distrace.data.split import Shape, every_mesh, read_split
 from distrace.training.train import load_samples
 
@@ -128,6 +128,26 @@ def test_a_mesh_that_is_mostly_sheets_is_left_out_with_the_reason(tmp_path: Path
     assert not report.usable
     assert report.reason == f"{report.lost:.0%} of what is seen of it bounds no solid"
     assert report.lost > 0.7
+
+
+def slabs(thickness: float) -> trimesh.Trimesh:
+    """A block, whose surface is 16, below a slab of 18, and of hardly any thickness."""
+    slab = trimesh.creation.box((3, thickness, 3), trimesh.transformations.translation_matrix((0, 1, 0)))
+    return trimesh.util.concatenate([trimesh.creation.box((2, 1, 2)), slab])
+
+
+@pytest.mark.parametrize("thickness", [0.5, 2])
+def test_a_solid_that_is_mostly_a_sheet_is_left_out_with_the_reason(tmp_path: Path, thickness: float) -> None:
+    _, scale = normalised_frame(slabs(1e-6))
+    slabs(thickness * THIN / scale).export(tmp_path / "slabs.ply")
+    report = doubt("slabs", load_solid(tmp_path / "slabs.ply"))
+    assert report.lost < 0.01
+    if thickness > 1:
+        assert report.usable
+        assert report.thin == 0
+    else:
+        assert report.thin == pytest.approx(18 / 34, abs=0.03)
+        assert report.reason == f"{report.thin:.0%} of its surface bounds nothing thicker than 0.002"
 
 
 # ---- sampling a folder: one run, with one worker, for all that follows

@@ -1,38 +1,22 @@
 """Classical stereo on photographs of a painted ball."""
 
 import sys
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 
 import numpy as np
 import pytest
 import torch
-from photographed import EXACT
+from photographed import striped_ball
 from test_fit_photos import ring
-from test_matching import stripes
 
-from distrace.boundary import shade
-from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.evaluation.semi_global import Rectified, stereo_points
-from distrace.primitives import sphere
-from distrace.render import render
+
+FINER = 1.5  # stripes than those that patches are compared on
 
 
-def photographs(cameras: Sequence[Camera]) -> list[Photograph]:
-    found = []
-    for number, camera in enumerate(cameras):
-        with torch.no_grad():
-            buffers = render(sphere(0.5), camera, config=EXACT)
-            image = shade(buffers, lambda points, *_: stripes(1.5 * points), torch.zeros(3))
-        found.append(Photograph(f"{number:02}", camera, image))
-    return found
-
-
-def test_points_of_a_painted_ball_lie_on_it(without_checks: Callable[[], AbstractContextManager[None]]) -> None:
+def test_points_of_a_painted_ball_lie_on_it() -> None:
     pytest.importorskip("cv2")
-    with without_checks():
-        views = photographs(ring(24, 120))
+    views = striped_ball(ring(24, 120), FINER)
     points = stereo_points(views)
     off = np.abs(np.linalg.norm(points, axis=1) - 0.5)
     assert len(points) > 2000
@@ -42,7 +26,7 @@ def test_points_of_a_painted_ball_lie_on_it(without_checks: Callable[[], Abstrac
 
 def test_rectified_views_see_the_origin_in_their_middle_columns_and_same_rows() -> None:
     pytest.importorskip("cv2")
-    first, second = photographs(ring(24, 60)[:2])
+    first, second = striped_ball(ring(24, 60)[:2], FINER)
     pair = Rectified.of(first, second)
     middle, _ = pair.camera.project(torch.zeros(3, dtype=torch.float64))
     assert middle.tolist() == pytest.approx([60.0, 60.0])
@@ -62,4 +46,4 @@ def test_images_without_anything_end_in_a_sentence() -> None:
 def test_without_opencv_the_sentence_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "cv2", None)
     with pytest.raises(ValueError, match=r"stereo needs OpenCV, which is not installed; `pip install 'distrace\[clips"):
-        stereo_points(photographs(ring(2, 20)))
+        stereo_points(striped_ball(ring(2, 20), FINER))

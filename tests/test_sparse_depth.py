@@ -90,7 +90,6 @@ def test_a_density_says_how_many_depths_are_left(place: Place) -> None:
     assert view.mask.sum() == counts["dense"]
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
     wanted = trial(place, density="20")
     first = done(place, wanted)
@@ -146,7 +145,6 @@ def test_rows_are_medians_and_ratios_are_averaged_over_columns() -> None:
     assert cells == [["sofas", "deepsdf", "4.00", "4.00"], ["sofas", "ours", "2.00", "3.00"]]
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_the_page_shows_table_pictures_and_apart_from_them_the_published_one(place: Place) -> None:
     results = [done(place, trial(place, method=method, density="100")) for method in ("points", "ours+mask")]
     text = depth_page("sparse-depth", results, place)

@@ -1,7 +1,5 @@
 """Depths by planes swept through the unit sphere, what views agree on of them, and hollows that no outline shows."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import pytest
@@ -43,13 +41,10 @@ def photographed(sdf: SDF, cameras: list[Camera]) -> list[Photograph]:
 
 
 @pytest.fixture(scope="module")
-def bowl(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
+def bowl() -> list[Photograph]:
     """Seen from its open side by six cameras."""
     places = [(azimuth, elevation) for azimuth in (-25, 0, 25) for elevation in (-15, 15)]
-    with without_checks():
-        return photographed(
-            BOWL, [Camera.orbit(*place, 3.0, height=120, width=120, focal_px=160.0) for place in places]
-        )
+    return photographed(BOWL, [Camera.orbit(*place, 3.0, height=120, width=120, focal_px=160.0) for place in places])
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +82,6 @@ def test_depths_contradict_what_fills_a_hollow_and_what_lacks(depths: AgreedDept
     assert contradicted(BOWL(points) + 0.1) > 3 * true
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_a_network_begins_with_a_hollow_that_no_outline_shows(bowl: list[Photograph], depths: AgreedDepths) -> None:
     specs, hollow = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4), torch.tensor([[0.0, 0.0, 0.5]])
     config, hull, found = ReconstructConfig(beginning=450, rays=256, learning_rate=5e-3), visual_hull(bowl), []

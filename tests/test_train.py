@@ -18,10 +18,10 @@ import torch
 from torch import Tensor
 
 import distrace.cli.train
-from distrace.checkpoint import load_model, save_experiment, save_model
+from distrace.checkpoint import Model, load_model, save_experiment, save_model
 from distrace.cli import main
 from distrace.data.samples import write_samples
-from distrace.decoder import NetworkSpecs
+from distrace.decoder import Decoder, NetworkSpecs
 from distrace.files import alone
 from distrace.training.resume import NAME, load_training, save_training
 from distrace.training.train import (
@@ -37,6 +37,7 @@ from distrace.training.train import (
     train,
     training_loss,
 )
+from distrace.training.wrong_places import CERTAIN, REACH, dwelling
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
@@ -227,6 +228,53 @@ def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> 
         before = second.decoder.lin0.parametrizations.weight.original1.clone()
         next(train(spheres(0.3, 0.4, 0.6), second, replace(CONFIG, warm_up=1)))
         assert not torch.equal(before, second.decoder.lin0.parametrizations.weight.original1), "the optimiser has it"
+
+
+class Spheres(Decoder):
+    """The code's first entry is the radius."""
+
+    def __init__(self) -> None:
+        super().__init__(NetworkSpecs(dims=(8,), code_length=4, latent_in=(), norm_layers=()))
+
+    def forward(self, points: Tensor, code: Tensor) -> Tensor:
+        return points.norm(dim=-1) - code[..., 0]
+
+
+def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> None:
+    """A ball of 0.4 is wrong for one of 0.5 between them, and up to REACH away samples count as well."""
+    samples = replace(spheres(0.5, 0.5, 0.5), names=["ball", "ball~1", "unknown"])
+    model = Model("balls", Spheres(), torch.tensor([[0.4, 0, 0, 0]]).repeat(2, 1), ("ball", "ball~1"))
+    dwelt = dwelling(samples, model, 5)
+    radii = {}
+    for side in ("outside", "inside"):
+        before, after = getattr(samples, side), getattr(dwelt, side)
+        times = torch.tensor([(after[0] == sample).all(-1).sum() for sample in before[0]])
+        assert set(times.tolist()) == {1, 5}
+        assert all(after[other] is before[other] for other in (1, 2)), "a variant, and what the model does not know"
+        radii[side] = before[0][:, :3].norm(dim=-1)
+        radii[side, 5] = radii[side][times == 5]
+    assert 0.5 <= radii["outside", 5].min() <= radii["outside", 5].max() < 0.5 + REACH
+    assert radii["inside", 5].min() > 0.4 - REACH
+    wrong = (radii["inside"] > 0.4) & (radii["inside"] < 0.5 - CERTAIN)
+    assert torch.isin(radii["inside"][wrong], radii["inside", 5]).all()
+
+
+def test_a_model_that_is_right_leaves_the_samples_as_they_are() -> None:
+    samples = spheres(0.5)
+    dwelt = dwelling(samples, Model("balls", Spheres(), torch.tensor([[0.5, 0, 0, 0]]), ("sphere0",)), 5)
+    assert torch.equal(dwelt.outside[0], samples.outside[0])
+    assert torch.equal(dwelt.inside[0], samples.inside[0])
+
+
+def test_a_run_that_dwells_needs_its_model_when_it_goes_on(tmp_path: Path, run, capsys) -> None:
+    samples, first, second = sample_files(tmp_path / "samples", 0.5), tmp_path / "first", tmp_path / "second"
+    run("train", samples, "--out", first, *TINY[2:], "--steps", "3")
+    run("train", samples, "--out", second, "--begin-with", first, "--steps", "2", "--dwell", "3")
+    with pytest.raises(SystemExit):
+        run("train", samples, "--out", second, "--steps", "4")
+    assert "add --begin-with" in capsys.readouterr().err
+    run("train", samples, "--out", second, "--steps", "4", "--begin-with", first)
+    assert checkpoint(second)["step"] == 4
 
 
 def test_a_folder_is_learnt_from_a_model_of_another_size(tmp_path: Path, run) -> None:

@@ -1,7 +1,5 @@
 """Where an object lies, told from photographs of a painted bumpy ball before its shape is known."""
 
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import replace
 
 import pytest
@@ -19,9 +17,8 @@ SHIFTED = Similarity(torch.eye(3), torch.tensor([0.15, -0.1, 0.12]), torch.tenso
 
 
 @pytest.fixture(scope="module")
-def views(without_checks: Callable[[], AbstractContextManager[None]]) -> list[Photograph]:
-    with without_checks():
-        return photographs(bumpy_balls(), ring(), SHIFTED)
+def views() -> list[Photograph]:
+    return photographs(bumpy_balls(), ring(), SHIFTED)
 
 
 def found(views: list[Photograph], *others: SDF) -> Similarity:
@@ -29,7 +26,6 @@ def found(views: list[Photograph], *others: SDF) -> Similarity:
     return whereabouts(Stage.of(views, 1.0, COMPARED), typical, Similarity.identity())
 
 
-@pytest.mark.usefixtures("unchecked")
 @pytest.mark.parametrize("masked", [False, True])
 def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool) -> None:
     if masked:
@@ -39,7 +35,6 @@ def test_an_object_off_the_middle_is_found(views: list[Photograph], masked: bool
     assert float(there.scale) == pytest.approx(0.8, abs=0.05)
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> None:
     lost = placed(bumpy_balls().field(TRUE), torch.diag(torch.tensor([0.3, 0.3, 0.3, 1.0])))
     some = views[::2]
@@ -48,7 +43,6 @@ def test_one_shape_that_is_not_typical_is_outvoted(views: list[Photograph]) -> N
     assert float(found(some, lost, lost).scale) > 2 * float(there.scale), "what most of them say counts"
 
 
-@pytest.mark.usefixtures("unchecked")
 def test_photographs_of_nothing_say_nothing(views: list[Photograph]) -> None:
     some = views[::3]
     blank = [replace(view, image=GREY.expand_as(view.image)) for view in some]

@@ -90,11 +90,12 @@ def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Prints rows of the same keys, not narrower than they are."""
-    cells = [[short(value) for value in row.values()] for row in rows]
+    """Prints rows, not narrower than they are; what a row has not stays empty."""
+    names = list(dict.fromkeys(name for row in rows for name in row))
+    cells = [[short(row.get(name, "")) for name in names] for row in rows]
     shown = Table(box=None, padding=(0, 1, 0, 0))
-    for name, column in zip(rows[0], zip(*cells)):
-        numeric = all(isinstance(row[name], int | float) for row in rows)
+    for name, column in zip(names, zip(*cells)):
+        numeric = all(isinstance(row.get(name, 0), int | float) for row in rows)
         width = max(len(name), *(len(cell) for cell in column))
         shown.add_column(name, justify="right" if numeric else "left", min_width=width, no_wrap=True)
     for line in cells:

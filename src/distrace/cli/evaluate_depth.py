@@ -168,7 +168,7 @@ class Multiview:
         for clip, some in of_clip.items():
             save_clip_page(run.out / "pages", clip, some, self.meshes)
         rows = multiview_rows(results)
-        show_table([{key: row.get(key, "") for key in rows[-1] | rows[0]} for row in rows])
+        show_table(rows)
         run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})
 
 

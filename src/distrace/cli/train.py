@@ -27,6 +27,7 @@ from distrace.training.resume import load_training, save_training
 from distrace.training.train import Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
 from distrace.training.train import start as start_training
 from distrace.training.train import train as run_training
+from distrace.training.wrong_places import dwelling
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
 TRIED = 20  # steps that tell how many fit into --minutes
@@ -45,6 +46,9 @@ class Train:
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
     large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
+    dwell: int | None = None  # 1; times a sample is drawn near places that --begin-with has on the wrong side
+    variant_weight: float | None = None  # 0.5; how often a variant, or what was invented, is drawn, to once the others
+    learning_rate: float | None = None  # 0.001; less where a model is learnt further
     samples_per_step: int | None = None  # 2,048
     layers: int | None = None  # 8
     width: int | None = None  # 512
@@ -67,6 +71,7 @@ class Train:
         """All of it, from samples to the run's result."""
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
         loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
+        known = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
@@ -74,7 +79,6 @@ class Train:
             config = self._changed(config)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
-            known = None if self.begin_with is None else opened(self.begin_with, run.device)
             specs = self._specs(known)
             config = replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
@@ -82,6 +86,8 @@ class Train:
             if known is not None:
                 begin_with(training, loaded.names, known)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
+        if config.dwell > 1:
+            loaded = self._dwelling(loaded, known, config.dwell)
         loss = _run(run, loaded, training, config, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
@@ -103,9 +109,18 @@ class Train:
             raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
         return replace(specs, norm_layers=tuple(range(len(specs.dims))), weight_norm=True)
 
+    def _dwelling(self, loaded: Samples, known: Model | None, times: int) -> Samples:
+        if known is None:
+            raise ValueError(f"{self.out} dwells on what a model has wrong, and no model was given; add --begin-with")
+        console.print(f"looking where {known.name} is wrong")
+        return dwelling(loaded, known, times)
+
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""
-        return replace(config, **_said(self, "steps", "wrong_sign", "large"))
+        said = _said(self, "steps", "wrong_sign", "large", "dwell", "variant_weight", "learning_rate")
+        if self.learning_rate is not None:
+            said["code_learning_rate"] = 2 * self.learning_rate
+        return replace(config, **said)
 
     def _check_same(self, training: Training, config: TrainConfig) -> None:
         """Raises `ValueError` where something was said that a run which goes on has otherwise, or did already."""

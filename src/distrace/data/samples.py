@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import trimesh
 from jaxtyping import Float
 
 from distrace.data.solid import Solid, first_met
@@ -15,6 +16,8 @@ VARIANCES = (0.0025, 0.00025, 0.000025)  # DeepSDF has the first two; the third 
 DOUBTFUL = 0.25  # a winding number this far from a whole number leaves the sign in doubt
 HOPELESS = 0.02  # a shape with a larger share of doubtful signs is not learnt
 HOLLOW = 0.3  # nor one of which a larger share of what is seen bounds no solid: cloth and cane drawn without thickness
+SHEET = 0.3  # nor one of which a larger share of the surface bounds nothing thicker than THIN
+THIN = 0.002  # in which a mesh of 256 cells, each 0.008 wide, does not tell two sides apart, nor a network
 BEHIND = 0.02  # what is seen of the solid, if so far behind what is seen of the mesh, is something else
 
 
@@ -29,6 +32,7 @@ class Doubt:
     usable: bool
     reason: str = ""  # why it is left out
     lost: float = 0.0  # share of what is seen of the mesh that bounds no solid
+    thin: float = 0.0  # share of the surface behind which the solid ends at once
 
 
 def sample(solid: Solid, count: int, seed: int, near: float = NEAR) -> Float[np.ndarray, "count 4"]:
@@ -45,10 +49,11 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * np.abs(solid.soup.bounds).max(0) * 1.05
     winding = solid.winding(points)
     doubtful = float((np.abs(winding - np.round(winding)) > DOUBTFUL).mean())
-    outer, missing = float(solid.surface.area / solid.soup.area), lost(solid)
+    outer, missing, sheet = float(solid.surface.area / solid.soup.area), lost(solid), thin(solid)
     reasons = [f"{doubtful:.1%} of its signs are doubtful"] if doubtful > HOPELESS else []
     reasons += [f"{missing:.0%} of what is seen of it bounds no solid"] if missing > HOLLOW else []
-    return Doubt(name, len(solid.soup.faces), outer, doubtful, not reasons, " and ".join(reasons), missing)
+    reasons += [f"{sheet:.0%} of its surface bounds nothing thicker than {THIN:g}"] if sheet > SHEET else []
+    return Doubt(name, len(solid.soup.faces), outer, doubtful, not reasons, " and ".join(reasons), missing, sheet)
 
 
 def lost(solid: Solid, count: int = 5000) -> float:
@@ -60,6 +65,13 @@ def lost(solid: Solid, count: int = 5000) -> float:
     of_soup, of_solid = (first_met(mesh, origins, directions) for mesh in (solid.soup, solid.surface))
     met = np.isfinite(of_soup)
     return float((of_solid[met] > of_soup[met] + BEHIND).mean()) if met.any() else 0.0
+
+
+def thin(solid: Solid, count: int = 5000) -> float:
+    """Of the surface, the share behind which the solid ends before THIN: a sheet with a face on either side."""
+    points, faces = trimesh.sample.sample_surface(solid.surface, count, seed=0)
+    inwards = -solid.surface.face_normals[faces]
+    return float((first_met(solid.surface, points + 1e-5 * inwards, inwards) < THIN).mean())
 
 
 def _in_ball(random: np.random.Generator, count: int) -> Float[np.ndarray, "count 3"]:

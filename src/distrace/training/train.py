@@ -1,5 +1,6 @@
 """Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
 
+import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -35,6 +36,7 @@ class TrainConfig:
     clamp: float = 0.1  # distances beyond are learnt as "far"
     wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
     large: float = torch.inf  # errors above count by their squares: what fills gaps is far off, and rare
+    dwell: int = 1  # times a sample is drawn where the network it began with has signs wrong, to once elsewhere
     code_penalty: float = 1e-4
     code_bound: float = 1.0
     code_deviation: float = 0.05  # of a code's entries at the start
@@ -49,6 +51,10 @@ class TrainConfig:
         if not (self.wrong_sign > 0 and self.large > 0):
             given = f"a wrong sign {self.wrong_sign:g} times as much, and errors above {self.large:g} squared"
             raise ValueError(f"{given} were asked for; both must be above 0")
+        if not (0 < self.learning_rate < math.inf and 0 < self.variant_weight <= 1 and self.dwell >= 1):
+            given = f"a rate of {self.learning_rate:g}, variants at {self.variant_weight:g}, places {self.dwell} times"
+            needed = "a rate above 0, a share above 0 and up to 1, and a whole number from 1"
+            raise ValueError(f"{given} were asked for; {needed} are needed")
 
 
 @dataclass(frozen=True)
