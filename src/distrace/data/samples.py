@@ -69,7 +69,7 @@ def lost(solid: Solid, count: int = 5000) -> float:
 
 def thin(solid: Solid, count: int = 5000) -> float:
     """Of the surface, the share behind which the solid ends before THIN: a sheet with a face on either side."""
-    points, faces = trimesh.sample.sample_surface(solid.surface, count, seed=0)
+    points, faces = trimesh.sample.sample_surface(solid.surface, count, seed=0)[:2]
     inwards = -solid.surface.face_normals[faces]
     return float((first_met(solid.surface, points + 1e-5 * inwards, inwards) < THIN).mean())
 
