@@ -13,9 +13,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-CHECKED = (
-    20  # calls of each function in a test and what is set up for it: all of them would be half of a long one's time
-)
+CHECKED = 20  # calls of each function, in a test and what is set up for it: to check all takes half of its time
+LONG = ("cli", "reconstruct", "fit_photos", "device", "fit_camera", "boundary", "whereabouts")
 
 torch.set_num_threads(1)
 settings.register_profile("light", deadline=None, max_examples=12, derandomize=True)
@@ -25,6 +24,11 @@ _checked = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))  
 _jaxtyped = jaxtyping.jaxtyped
 _kept: dict[tuple, Callable] = {}
 _calls: Counter[object] = Counter()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Files that take long come first, or one process would still be at them when the other has nothing left."""
+    items.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
