@@ -15,13 +15,14 @@ from statistics import mean
 import numpy as np
 import pytest
 import torch
+from test_solvers import Spheres
 from torch import Tensor
 
 import distrace.cli.train
 from distrace.checkpoint import Model, load_model, save_experiment, save_model
 from distrace.cli import main
 from distrace.data.samples import write_samples
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.decoder import NetworkSpecs
 from distrace.files import alone
 from distrace.training.resume import NAME, load_training, save_training
 from distrace.training.train import (
@@ -230,16 +231,6 @@ def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> 
         assert not torch.equal(before, second.decoder.lin0.parametrizations.weight.original1), "the optimiser has it"
 
 
-class Spheres(Decoder):
-    """The code's first entry is the radius."""
-
-    def __init__(self) -> None:
-        super().__init__(NetworkSpecs(dims=(8,), code_length=4, latent_in=(), norm_layers=()))
-
-    def forward(self, points: Tensor, code: Tensor) -> Tensor:
-        return points.norm(dim=-1) - code[..., 0]
-
-
 def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> None:
     """A ball of 0.4 is wrong for one of 0.5 between them, and up to REACH away samples count as well."""
     samples = replace(spheres(0.5, 0.5, 0.5), names=["ball", "ball~1", "unknown"])
@@ -264,6 +255,17 @@ def test_a_model_that_is_right_leaves_the_samples_as_they_are() -> None:
     dwelt = dwelling(samples, Model("balls", Spheres(), torch.tensor([[0.5, 0, 0, 0]]), ("sphere0",)), 5)
     assert torch.equal(dwelt.outside[0], samples.outside[0])
     assert torch.equal(dwelt.inside[0], samples.inside[0])
+
+
+def test_a_run_goes_on_at_the_rate_that_is_given(tmp_path: Path) -> None:
+    samples = spheres(0.3, 0.6)
+    save_training(tmp_path, finished(samples, CONFIG), CONFIG, samples.names)
+    training, config = load_training(tmp_path, samples.names, CPU)
+    other = replace(config, steps=1000, learning_rate=0.01, code_learning_rate=0.03)
+    next(train(samples, training, other))
+    share = min(1, (CONFIG.steps + 1) / CONFIG.warm_up)
+    rates = [group["lr"] for group in training.optimiser.param_groups]
+    assert rates == pytest.approx([0.01 * share, 0.03 * share])
 
 
 def test_a_run_that_dwells_needs_its_model_when_it_goes_on(tmp_path: Path, run, capsys) -> None:

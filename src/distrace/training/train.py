@@ -119,10 +119,7 @@ def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.d
     torch.manual_seed(config.seed)
     decoder = Decoder(specs).to(device)
     codes = nn.Parameter(config.code_deviation * torch.randn(shapes, specs.code_length).to(device))
-    groups = [
-        {"params": list(decoder.parameters()), "peak": config.learning_rate},
-        {"params": [codes], "peak": config.code_learning_rate},
-    ]
+    groups = [{"params": list(decoder.parameters())}, {"params": [codes]}]
     return Training(decoder, codes, torch.optim.Adam(groups, lr=0.0, fused=True))
 
 
@@ -149,8 +146,9 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
     training.decoder.train()
     while training.step < config.steps:
         began = time.perf_counter()
-        for group in training.optimiser.param_groups:
-            group["lr"] = group["peak"] * _rate(training.step, config)
+        highest = config.learning_rate, config.code_learning_rate
+        for group, rate in zip(training.optimiser.param_groups, highest, strict=True):
+            group["lr"] = rate * _rate(training.step, config)
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = draw(samples, config)
         codes = training.codes[shapes]
