@@ -71,7 +71,6 @@ class Train:
         """All of it, from samples to the run's result."""
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
         loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
-        known = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         if resumed:
             training, config = resumed
@@ -79,6 +78,7 @@ class Train:
             config = self._changed(config)
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
+            known = None if self.begin_with is None else opened(self.begin_with, run.device)
             specs = self._specs(known)
             config = replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
             config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
@@ -87,7 +87,7 @@ class Train:
                 begin_with(training, loaded.names, known)
             config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
         if config.dwell > 1:
-            loaded = self._dwelling(loaded, known, config.dwell)
+            loaded = self._dwelling(loaded, config.dwell, run.device)
         loss = _run(run, loaded, training, config, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
@@ -109,11 +109,11 @@ class Train:
             raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
         return replace(specs, norm_layers=tuple(range(len(specs.dims))), weight_norm=True)
 
-    def _dwelling(self, loaded: Samples, known: Model | None, times: int) -> Samples:
-        if known is None:
+    def _dwelling(self, loaded: Samples, times: int, device: torch.device) -> Samples:
+        if self.begin_with is None:
             raise ValueError(f"{self.out} dwells on what a model has wrong, and no model was given; add --begin-with")
-        console.print(f"looking where {known.name} is wrong")
-        return dwelling(loaded, known, times)
+        console.print(f"looking where {self.begin_with} is wrong")
+        return dwelling(loaded, opened(self.begin_with, device), times)
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""

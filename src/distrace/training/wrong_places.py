@@ -7,7 +7,6 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from distrace.checkpoint import Model
-from distrace.decoder import CPU_CHUNK
 from distrace.training.train import VARIANT, Samples
 
 REACH = 0.02  # a sample so near to one whose sign is wrong counts as well, on whichever side of the surface
@@ -35,9 +34,7 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
 @torch.no_grad()
 def _wrong_places(model: Model, name: str, samples: Float[Tensor, "n 4"]) -> Bool[Tensor, "n"]:
     """Which samples lie within REACH of one whose sign the model has wrong for certain."""
-    code = model.code_of(name).to(samples.device)
-    values = torch.cat([model.decoder(part[:, :3], code.expand(len(part), -1)) for part in samples.split(CPU_CHUNK)])
-    distances = samples[:, 3]
+    values, distances = model.field(model.code_of(name))(samples[:, :3]), samples[:, 3]
     wrong = (values * distances < 0) & (distances.abs() > CERTAIN)
     if not wrong.any():
         return wrong
