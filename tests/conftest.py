@@ -1,14 +1,12 @@
 """One thread, few examples, types checked in a test's first calls; where the contract says 30, a `float` takes it."""
 
 from collections import Counter
-from collections.abc import Callable
-from functools import cache, partial, wraps
+from functools import partial, wraps
 from types import FunctionType
 from typing import Any
 
 import beartype
 import jaxtyping
-import jaxtyping._array_types
 import pytest
 import torch
 from hypothesis import settings
@@ -22,7 +20,6 @@ settings.load_profile("light")
 
 _checked = beartype.beartype(conf=beartype.BeartypeConf(is_pep484_tower=True))  # PEP 484 lets an int pass for a float
 _jaxtyped = jaxtyping.jaxtyped
-_kept: dict[tuple, Callable] = {}
 _calls: Counter[object] = Counter()
 
 
@@ -54,17 +51,6 @@ def _at_first(function: Any = None, *, typechecker: Any) -> Any:
     return called
 
 
-def _check(stub: Callable) -> Callable:
-    """What checks a function's types; of a function within another, made anew in each call of that, only once."""
-    if "<locals>" not in stub.__qualname__ or stub.__defaults__ or stub.__kwdefaults__:
-        return _checked(stub)
-    key = (stub.__module__, stub.__qualname__, stub.__code__, *stub.__annotations__.items())
-    if key not in _kept:
-        _kept[key] = _checked(stub)
-    return _kept[key]
-
-
 # The import hook looks these names up when it checks a module.
 jaxtyping.jaxtyped = _at_first
-beartype.beartype = _check
-jaxtyping._array_types._make_array = cache(jaxtyping._array_types._make_array)  # so that equal annotations are equal
+beartype.beartype = _checked
