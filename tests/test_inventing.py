@@ -1,13 +1,18 @@
 """Shapes put together at random: closed, upright, facing forward, and each of its own."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from manifold3d import Manifold, OpType
 
 from distrace.cli.train import _sample_files
 from distrace.data.inventing import INVENTORS, invented
-from distrace.data.inventing.parts import block, bowed, disc, rod, row, tilted
+from distrace.data.inventing.foot import foot
+from distrace.data.inventing.parts import Part, block, bowed, disc, rod, row, sheet, tilted
+from distrace.data.inventing.shell import bent, tub
 
 CLASSES = tuple(INVENTORS)
 
@@ -19,6 +24,11 @@ def test_a_shape_is_closed(category: str, seed: int) -> None:
     assert mesh.is_watertight
     assert mesh.is_winding_consistent
     assert 0 < mesh.volume < mesh.bounding_box.volume
+
+
+@pytest.mark.parametrize("number", [248, 310])
+def test_a_back_thinner_than_its_edges_can_be_round_is_made(number: int) -> None:
+    assert invented("sofas", np.random.default_rng([0, number])).is_watertight
 
 
 @pytest.mark.parametrize("category", ["sofas", "chairs", "tables"])
@@ -98,6 +108,39 @@ def test_the_sides_of_a_bowed_board_are_in_front() -> None:
     sides = points[np.abs(points[:, 0]) > 0.9, 2].min()
     assert sides > points[np.abs(points[:, 0]) < 0.2, 2].max() - 0.1 > -0.1
     assert sides > 0.2
+
+
+def united(parts: list[Part]) -> trimesh.Trimesh:
+    mesh = Manifold.batch_boolean([Manifold.hull_points(part) for part in parts], OpType.Add).to_mesh64()
+    return trimesh.Trimesh(mesh.vert_properties, mesh.tri_verts, process=False)
+
+
+def test_a_sheet_is_a_grid_with_half_its_thickness_all_around() -> None:
+    grid = np.stack(np.meshgrid([0.0, 1, 2], [0.0, 1], [0.5], indexing="ij"), axis=-1)[:, :, 0]
+    parts = sheet(grid, 0.2)
+    assert len(parts) == 2
+    assert np.concatenate(parts).min(0) == pytest.approx([-0.1, -0.1, 0.4])
+    assert np.concatenate(parts).max(0) == pytest.approx([2.1, 1.1, 0.6])
+
+
+@pytest.mark.parametrize("kind", [bent, tub])
+@pytest.mark.parametrize("seed", range(6))
+def test_a_shell_is_one_thin_piece_as_wide_as_asked_for_and_open_to_the_front(kind: Callable, seed: int) -> None:
+    mesh = united(kind(np.random.default_rng(seed), 0.5, 0.5, (0.45, 0.9)))
+    assert len(mesh.split()) == 1
+    assert mesh.volume / mesh.area < 0.025, "half of the greatest thickness"
+    assert mesh.bounds[0, 1] > 0.3
+    assert mesh.bounds[1, 1] == pytest.approx(0.9, abs=0.06)
+    top = mesh.vertices[mesh.vertices[:, 1] > 0.8]
+    assert top[:, 2].mean() < 0, "its back is at the rear"
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_foot_is_one_piece_from_the_floor_to_the_seat(seed: int) -> None:
+    mesh = united(foot(np.random.default_rng(seed), 0.3, 0.45))
+    assert len(mesh.split()) == 1
+    assert mesh.bounds[:, 1] == pytest.approx([0, 0.45], abs=0.01)
+    assert mesh.bounds[1, [0, 2]] == pytest.approx(0.3, abs=0.1)
 
 
 def test_what_leans_backwards_has_its_top_behind() -> None:

@@ -4,11 +4,12 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
@@ -16,6 +17,7 @@ from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 from distrace.training.course import record
+from distrace.training.recorded import Recorded
 
 VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
 
@@ -58,12 +60,35 @@ class TrainConfig:
 
 
 @dataclass(frozen=True)
+class Side:
+    """The samples of all shapes on one side of their surfaces, one shape's after another's: drawn in one go."""
+
+    samples: Float[Tensor, "n 4"]
+    begins: Int[Tensor, "shapes"]
+    counts: Int[Tensor, "shapes"]
+
+    @staticmethod
+    def of(parts: list[Float[Tensor, "_ 4"]]) -> "Side":
+        counts = torch.tensor([len(part) for part in parts])
+        return Side(torch.cat(parts), counts.cumsum(0) - counts, counts)
+
+    def drawn(self, shapes: Int[Tensor, "some"], number: int) -> Float[Tensor, "some number 4"]:
+        """As many of each of the shapes, at random."""
+        places = (torch.rand(len(shapes), number, dtype=torch.float64) * self.counts[shapes, None]).long()
+        return self.samples[(self.begins[shapes, None] + places).to(self.samples.device)]
+
+
+@dataclass(frozen=True)
 class Samples:
     """Signed samples of the shapes to learn."""
 
     names: list[str]
     outside: list[Float[Tensor, "_ 4"]]
     inside: list[Float[Tensor, "_ 4"]]
+
+    @cached_property
+    def sides(self) -> tuple[Side, Side]:
+        return Side.of(self.outside), Side.of(self.inside)
 
     def weights(self, variants: float) -> Float[Tensor, "shapes"]:
         return torch.tensor([variants if VARIANT in name else 1.0 for name in self.names])
@@ -142,25 +167,47 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
 
     The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
     """
-    device = training.codes.device
+    device, step = training.codes.device, partial(_step, training, config)
     training.decoder.train()
+    _prepare(training.optimiser, device)
+    if device.type == "cuda":
+        step = Recorded(step)
     while training.step < config.steps:
         began = time.perf_counter()
-        highest = config.learning_rate, config.code_learning_rate
-        for group, rate in zip(training.optimiser.param_groups, highest, strict=True):
-            group["lr"] = rate * _rate(training.step, config)
+        share = _rate(training.step, config)
+        _set_rates(training.optimiser, (share * config.learning_rate, share * config.code_learning_rate))
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = draw(samples, config)
-        codes = training.codes[shapes]
-        with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
-            values = training.decoder(batch[..., :3], codes[:, None])
-        loss = training_loss(values.float(), batch[..., 3], config)
-        training.optimiser.zero_grad()
-        (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
-        training.optimiser.step()
-        bound_codes(training.codes, config.code_bound)
-        training.record(value := loss.item())
-        yield Step(training.step, value, time.perf_counter() - began)
+        training.record(loss := step(shapes.to(device), batch).item())
+        yield Step(training.step, loss, time.perf_counter() - began)
+
+
+def _step(training: Training, config: TrainConfig, shapes: Tensor, batch: Float[Tensor, "shapes n 4"]) -> Tensor:
+    """A step on the samples drawn; their loss."""
+    codes = training.codes.index_select(0, shapes)
+    with torch.autocast(batch.device.type, torch.bfloat16, enabled=config.bfloat16, cache_enabled=False):
+        values = training.decoder(batch[..., :3], codes[:, None])
+    loss = training_loss(values.float(), batch[..., 3], config)
+    training.optimiser.zero_grad()
+    (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
+    training.optimiser.step()
+    bound_codes(training.codes, config.code_bound)
+    return loss.detach()
+
+
+def _prepare(optimiser: torch.optim.Adam, device: torch.device) -> None:
+    """Makes the optimiser one whose steps can be recorded, on a GPU, or cannot, whatever it was before."""
+    recorded = device.type == "cuda"
+    for group in optimiser.param_groups:
+        group["capturable"], group["lr"] = recorded, torch.zeros((), device=device) if recorded else 0.0
+
+
+def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
+    for group, rate in zip(optimiser.param_groups, rates, strict=True):
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)  # a recorded step reads it where it lies
+        else:
+            group["lr"] = rate
 
 
 def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:
@@ -168,9 +215,7 @@ def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "
     count = min(config.shapes_per_step, len(samples.names))
     shapes = torch.multinomial(samples.weights(config.variant_weight), count)
     per_side = max(config.samples_per_step // count // 2, 1)
-    sides = [(samples.outside[shape], samples.inside[shape]) for shape in shapes]
-    batch = [torch.cat([side[torch.randint(len(side), (per_side,))] for side in pair]) for pair in sides]
-    return shapes, torch.stack(batch)
+    return shapes, torch.cat([side.drawn(shapes, per_side) for side in samples.sides], dim=1)
 
 
 def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:
@@ -207,7 +252,9 @@ def _rate(step: int, config: TrainConfig) -> float:
 
 
 def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:
-    """Whether this machine trains faster with bfloat16 products: some processors emulate them."""
+    """Whether this machine trains faster with bfloat16 products: some processors emulate them, and old GPUs."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)  # a few steps are over too soon to tell
     seconds = {}
     for bfloat16 in (False, True, False, True):  # the second time of each counts
         config = TrainConfig(steps=2, bfloat16=bfloat16)

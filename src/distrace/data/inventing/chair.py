@@ -2,16 +2,21 @@
 
 import numpy as np
 
+from .foot import foot
 from .parts import Part, Point, bar, block, bowed, disc, post, rod, tilted
+from .shell import shell
 from .sofa import sofa
 
 
 def chair(random: np.random.Generator) -> list[Part]:
-    """One seat on legs, a foot or a frame, with or without back and arms; one in eight is an upholstered armchair."""
+    """One seat on legs, a foot or a frame, with or without back and arms; some are upholstered, some a shell."""
     if random.random() < 0.12:
         return sofa(random, wide=random.uniform(0.6, 0.95))
     wide, deep, high = random.uniform(0.38, 0.62), random.uniform(0.38, 0.58), random.uniform(0.4, 0.52)
     top = high + random.uniform(0.28, 0.65)
+    if random.random() < 0.17:
+        parts = shell(random, wide, deep, (high, top)) + base(random, 0.8 * wide, 0.8 * deep, high - 0.02)
+        return parts + (arms(random, wide, deep, high, random.uniform(0.14, 0.28)) if random.random() < 0.2 else [])
     thick = random.choice([random.uniform(0.02, 0.05), random.uniform(0.05, 0.13)])
     parts = seat(random, wide, deep, high, thick)
     parts += base(random, wide, deep, high - thick / 2)
@@ -41,7 +46,8 @@ def seat(random: np.random.Generator, wide: float, deep: float, high: float, thi
 
 def base(random: np.random.Generator, wide: float, deep: float, high: float) -> list[Part]:
     """What carries a seat of which the underside is at `high`."""
-    style = random.choice(["legs", "foot", "sled", "cantilever", "crossed"], p=[0.62, 0.14, 0.09, 0.08, 0.07])
+    styles = ["legs", "foot", "sled", "cantilever", "crossed", "folding"]
+    style = random.choice(styles, p=[0.5, 0.2, 0.08, 0.08, 0.07, 0.07])
     x, z, thin = (
         wide / 2 - random.uniform(0.015, 0.06),
         deep / 2 - random.uniform(0.015, 0.06),
@@ -51,6 +57,8 @@ def base(random: np.random.Generator, wide: float, deep: float, high: float) -> 
         return legs(random, (x, z), high, thin)
     if style == "foot":
         return foot(random, random.uniform(0.2, 0.34), high)
+    if style == "folding":
+        return folding(random, (x, z), high)
     parts = []
     for s in (-x, x):
         front, rear = (s, thin, z), (s, thin, -z)
@@ -60,6 +68,21 @@ def base(random: np.random.Generator, wide: float, deep: float, high: float) -> 
             parts += [rod(front, (s, high, z), thin, thin), rod(front, rear, thin, thin)]
             parts += [rod(rear if style == "sled" else (s, high, z), (s, high, -z), thin, thin)]
     return parts + [rod((-x, y, -z), (x, y, -z), thin, thin) for y in (thin, high)]
+
+
+def folding(random: np.random.Generator, place: tuple[float, float], high: float) -> list[Part]:
+    """Two frames that cross at the sides; the one that stands in front goes on upwards behind the seat."""
+    (x, z), thin, inner = place, random.uniform(0.007, 0.015), random.uniform(0.0, 0.03)
+    rear, meets, above = -z * random.uniform(0.6, 1.1), z * random.uniform(0.1, 1.0), random.uniform(0.0, 0.45)
+    slope, parts = -2 * z * random.uniform(0.7, 1.0) / high, []
+    ends = [((x, 0.0, z), (x, high + above, z + slope * (high + above)))]
+    ends += [((x - inner, 0.0, rear), (x - inner, high, meets))]
+    for begin, end in ends:
+        y = random.uniform(0.03, 0.45) * high
+        at = np.array(begin) + (np.array(end) - begin) * y / end[1]
+        parts += [bar(np.array(begin) * (s, 1, 1), np.array(end) * (s, 1, 1), thin) for s in (-1, 1)]
+        parts += [bar(at * (-1, 1, 1), at, 0.8 * thin), bar(np.array(end) * (-1, 1, 1), end, 0.8 * thin)]
+    return parts
 
 
 def legs(random: np.random.Generator, place: tuple[float, float], high: float, thin: float) -> list[Part]:
@@ -83,23 +106,6 @@ def legs(random: np.random.Generator, place: tuple[float, float], high: float, t
         parts += [block((-x, high - 0.06, s * z - thin / 2), (x, high, s * z + thin / 2), 0.003) for s in (-1, 1)]
         parts += [block((s * x - thin / 2, high - 0.06, -z), (s * x + thin / 2, high, z), 0.003) for s in (-1, 1)]
     return parts
-
-
-def foot(random: np.random.Generator, radius: float, high: float) -> list[Part]:
-    """A column on a disc, or on a star with or without wheels."""
-    column = rod((0, 0.04, 0), (0, high, 0), random.uniform(0.02, 0.04), random.uniform(0.015, 0.03))
-    if random.random() < 0.35:
-        return [
-            column,
-            disc((0, 0, 0), radius, random.uniform(0.015, 0.04)),
-            rod((0, 0.02, 0), (0, 0.1, 0), 0.09, 0.03),
-        ]
-    arms, wheels = int(random.integers(4, 6)), random.random() < 0.5
-    low = 0.05 if wheels else 0.015
-    ends = [(radius * np.sin(a), low, radius * np.cos(a)) for a in np.arange(arms) * 2 * np.pi / arms + 0.3]
-    star = [rod((0, low + random.uniform(0.02, 0.06), 0), end, 0.03, 0.015) for end in ends]
-    balls = [block((x - 0.025, 0.0, z - 0.025), (x + 0.025, 0.05, z + 0.025), 0.024) for x, _, z in ends]
-    return [column, *star, *(balls if wheels else [])]
 
 
 def back(random: np.random.Generator, wide: float, deep: float, heights: tuple[float, float]) -> list[Part]:

@@ -17,6 +17,7 @@ Point = tuple[float, float, float]
 Vector = Sequence[float] | Float[np.ndarray, "3"]
 
 BALL = trimesh.creation.icosphere(subdivisions=2).vertices.view(np.ndarray)
+OCTAHEDRON = np.concatenate([np.eye(3), -np.eye(3)])
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 
 
@@ -62,6 +63,12 @@ def bowed(low: Vector, high: Vector, bow: float, radius: float) -> list[Part]:
     depths = bow * (ends / max(abs(ends[0]), 1e-9)) ** 2
     edges = [block((x, low[1], low[2] + z), (x + 1e-3, high[1], high[2] + z), radius) for x, z in zip(ends, depths)]
     return [np.concatenate(pair) for pair in pairwise(edges)]
+
+
+def sheet(grid: Float[np.ndarray, "rows columns 3"], thick: float) -> list[Part]:
+    """A curved one through the points of a grid: one part for each four of them, which need not lie in a plane."""
+    corners = np.concatenate([grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[1:, 1:]], axis=-1).reshape(-1, 4, 3)
+    return list((corners[:, :, None] + thick / 2 * OCTAHEDRON).reshape(len(corners), -1, 3))
 
 
 def row(count: int, low: Vector, high: Vector, radius: float, axis: int = 0) -> list[Part]:

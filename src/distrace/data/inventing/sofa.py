@@ -47,7 +47,8 @@ def back(
     parts: list[Part] = []
     if style in ("board", "both"):
         depth = thick if style == "board" else thick * random.uniform(0.3, 0.6)
-        parts.append(block((-half, base, rear), (half, high, rear + depth), random.uniform(0.01, depth / 2.1)))
+        radius = random.uniform(0.01, max(depth / 2.1, 0.01))
+        parts.append(block((-half, base, rear), (half, high, rear + depth), radius))
     if style == "slats":
         bars = int(random.integers(4, 14))
         parts.append(block((-half, high - 0.06, rear), (half, high, rear + 0.04), 0.01))

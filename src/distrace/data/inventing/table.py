@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from .chair import foot, legs
+from .chair import legs
+from .foot import foot
 from .parts import Part, bar, block, disc
 
 
