@@ -16,7 +16,7 @@ from distrace.data import sampling
 from distrace.data.samples import THIN, Doubt, doubt, lost, sample, write_samples
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, normalised_frame
 from distrace.data.split import Shape, every_mesh, read_split
-from distrace.training.train import load_samples
+from distrace.training.batches import load_samples
 
 CUBE = RADIUS / math.sqrt(3) * 2  # the edge of a normalised cube
 COUNT = 5000

@@ -24,16 +24,14 @@ from distrace.cli import main
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.files import alone
+from distrace.training.batches import Samples, load_samples
 from distrace.training.resume import NAME, load_training, save_training
 from distrace.training.train import (
-    Samples,
     Step,
     TrainConfig,
     Training,
     begin_with,
     bound_codes,
-    draw,
-    load_samples,
     start,
     train,
     training_loss,
@@ -123,7 +121,7 @@ def test_two_spheres_get_codes_of_their_own() -> None:
 
 def test_a_draw_takes_as_many_samples_inside_as_outside_of_every_shape() -> None:
     torch.manual_seed(0)
-    shapes, batch = draw(spheres(0.3, 0.6, 0.5), replace(CONFIG, shapes_per_step=2))
+    shapes, batch = spheres(0.3, 0.6, 0.5).drawn(shapes=2, samples=64, variants=1.0)
     assert len(set(shapes.tolist())) == 2
     assert batch.shape == (2, 32, 4)
     assert ((batch[..., 3] < 0).sum(1) == 16).all()

@@ -22,9 +22,10 @@ from distrace.pages.charts import save_course
 from distrace.pages.report import View
 from distrace.render import render
 from distrace.shading import save_png, side_by_side
+from distrace.training.batches import Samples, load_samples
 from distrace.training.course import COURSE
 from distrace.training.resume import load_training, save_training
-from distrace.training.train import Samples, TrainConfig, Training, begin_with, faster_in_bfloat16, load_samples
+from distrace.training.train import TrainConfig, Training, begin_with, faster_in_bfloat16
 from distrace.training.train import start as start_training
 from distrace.training.train import train as run_training
 from distrace.training.wrong_places import dwelling

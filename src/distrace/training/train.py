@@ -4,22 +4,18 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from functools import cached_property, partial
-from pathlib import Path
+from functools import partial
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn.utils.parametrize import is_parametrized
 
 from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.errors import explained
+from distrace.training.batches import Samples
 from distrace.training.course import record
 from distrace.training.recorded import Recorded
-
-VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
 
 
 @dataclass(frozen=True)
@@ -59,44 +55,6 @@ class TrainConfig:
             raise ValueError(f"{given} were asked for; {needed} are needed")
 
 
-@dataclass(frozen=True)
-class Side:
-    """The samples of all shapes on one side of their surfaces, one shape's after another's: drawn in one go."""
-
-    samples: Float[Tensor, "n 4"]
-    begins: Int[Tensor, "shapes"]
-    counts: Int[Tensor, "shapes"]
-
-    @staticmethod
-    def of(parts: list[Float[Tensor, "_ 4"]]) -> "Side":
-        counts = torch.tensor([len(part) for part in parts])
-        return Side(torch.cat(parts), counts.cumsum(0) - counts, counts)
-
-    def drawn(self, shapes: Int[Tensor, "some"], number: int) -> Float[Tensor, "some number 4"]:
-        """As many of each of the shapes, at random."""
-        places = (torch.rand(len(shapes), number, dtype=torch.float64) * self.counts[shapes, None]).long()
-        return self.samples[(self.begins[shapes, None] + places).to(self.samples.device)]
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Signed samples of the shapes to learn."""
-
-    names: list[str]
-    outside: list[Float[Tensor, "_ 4"]]
-    inside: list[Float[Tensor, "_ 4"]]
-
-    @cached_property
-    def sides(self) -> tuple[Side, Side]:
-        return Side.of(self.outside), Side.of(self.inside)
-
-    def weights(self, variants: float) -> Float[Tensor, "shapes"]:
-        return torch.tensor([variants if VARIANT in name else 1.0 for name in self.names])
-
-    def to(self, device: torch.device) -> "Samples":
-        return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
-
-
 @dataclass
 class Training:
     """What a run changes as it goes on, and what a checkpoint holds."""
@@ -120,23 +78,6 @@ class Step:
     step: int
     loss: float
     seconds: float
-
-
-def load_samples(paths: list[Path]) -> Samples:
-    """Reads DeepSDF's `.npz` files. Raises `ValueError` for a file without `pos` and `neg` of shape [n, 4]."""
-    outside, inside = [], []
-    for path in paths:
-        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg"):
-            with np.load(path, allow_pickle=False) as archive:
-                pos, neg = (archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg"))
-        for name, part in (("pos", pos), ("neg", neg)):
-            if part.ndim != 2 or part.shape[1] != 4 or not len(part) or not np.isfinite(part).all():
-                raise ValueError(
-                    f"{path}: {name} has shape {list(part.shape)}; finite values of shape [n, 4] are needed"
-                )
-        outside.append(torch.from_numpy(pos))
-        inside.append(torch.from_numpy(neg))
-    return Samples([path.stem for path in paths], outside, inside)
 
 
 def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
@@ -177,7 +118,7 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
         share = _rate(training.step, config)
         _set_rates(training.optimiser, (share * config.learning_rate, share * config.code_learning_rate))
         torch.manual_seed((config.seed << 32) + training.step)
-        shapes, batch = draw(samples, config)
+        shapes, batch = samples.drawn(config.shapes_per_step, config.samples_per_step, config.variant_weight)
         training.record(loss := step(shapes.to(device), batch).item())
         yield Step(training.step, loss, time.perf_counter() - began)
 
@@ -208,14 +149,6 @@ def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
             group["lr"].fill_(rate)  # a recorded step reads it where it lies
         else:
             group["lr"] = rate
-
-
-def draw(samples: Samples, config: TrainConfig) -> tuple[Tensor, Float[Tensor, "shapes n 4"]]:
-    """A step's shapes, and as many samples inside as outside of each."""
-    count = min(config.shapes_per_step, len(samples.names))
-    shapes = torch.multinomial(samples.weights(config.variant_weight), count)
-    per_side = max(config.samples_per_step // count // 2, 1)
-    return shapes, torch.cat([side.drawn(shapes, per_side) for side in samples.sides], dim=1)
 
 
 def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:

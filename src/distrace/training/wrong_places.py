@@ -7,7 +7,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from distrace.checkpoint import Model
-from distrace.training.train import VARIANT, Samples
+from distrace.training.batches import VARIANT, Samples
 
 REACH = 0.02  # a sample so near to one whose sign is wrong counts as well, on whichever side of the surface
 CERTAIN = 0.002  # the sign of a sample nearer to the surface says little
