@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from distrace.errors import explained
@@ -48,10 +48,13 @@ class Samples:
     def sides(self) -> tuple[Side, Side]:
         return Side.of(self.outside), Side.of(self.inside)
 
+    @cached_property
+    def variant(self) -> Bool[Tensor, "shapes"]:
+        return torch.tensor([VARIANT in name for name in self.names])
+
     def drawn(self, shapes: int, samples: int, variants: float) -> Batch:
         """So many shapes, of which variants are drawn less often, and of all together so many samples."""
-        weights = torch.tensor([variants if VARIANT in name else 1.0 for name in self.names])
-        some = torch.multinomial(weights, min(shapes, len(self.names)))
+        some = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
         per_side = max(samples // len(some) // 2, 1)
         return some, torch.cat([side.drawn(some, per_side) for side in self.sides], dim=1)
 

@@ -40,9 +40,9 @@ def star(random: np.random.Generator, radius: float) -> list[Part]:
     parts = [rod((0, hub - 0.03, 0), (0, hub + 0.04, 0), 0.03, 0.028)]
     for angle in np.arange(arms) * 2 * np.pi / arms + random.uniform(0, 2 * np.pi):
         x, z = radius * np.sin(angle), radius * np.cos(angle)
-        knee = (bend * x, hub - (hub - low) * 0.3, bend * z)
-        parts += [rod((0, hub, 0), knee, thick, slim), rod(knee, (x, low, z), slim, slim)] if bend < 1 else []
-        parts += [rod((0, hub, 0), (x, low, z), thick, slim)] if bend == 1 else []
+        knees = [((bend * x, hub - (hub - low) * 0.3, bend * z), slim)] if bend < 1 else []
+        joints = [((0.0, hub, 0.0), thick), *knees, ((x, low, z), slim)]
+        parts += [rod(begin, end, first, last) for (begin, first), (end, last) in pairwise(joints)]
         parts += wheel.at((x, low, z), random.uniform(0, 2 * np.pi)) if wheels else []
     return parts
 
