@@ -18,10 +18,11 @@ from distrace.rounded import quickest
 from distrace.surface import minimum_and_value
 from distrace.trace import TraceConfig, sphere_trace
 
-BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
+BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is not seen
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
-WATCHED = 0.075  # … and those that come closer than this after each step; the others when a stage begins
-REACH, ROUNDS = 0.05, 2  # to two thousandths
+WATCHED = 0.075  # … and those that come closer than this after each step
+REACH, ROUNDS = 0.05, 2  # to two thousandths, at first; …
+NEAR, ROUNDS_NEAR = 0.02, 1  # … a step moves it little
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
 
 
@@ -60,15 +61,15 @@ class Problem:
 
     @torch.no_grad()
     def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
-        """Along all rays; those that ended on the surface last are followed from there on.
+        """Along all rays, which have been looked along where there is a `last` one.
 
         Of those without a depth the ones that disagree with the mask are compared, and those that touch the shape,
         where the field is least; those that are near to that are watched.
         """
-        sdf, seen, near = self._field(w), self.seen, self.seen.bounds.near
         if last is not None:
-            near = torch.where(last.hit | seen.known, last.distance - BACK, near)
-        t, hit = self._met(sdf, seen, near)
+            return last
+        sdf, seen = self._field(w), self.seen
+        t, hit = self._met(sdf, seen, seen.bounds.near)
         free = ~seen.known & ~seen.is_object & seen.bounds.meets
         aside = (free & ~hit).nonzero()[:, 0]
         values = sdf(seen.rays[aside].at(t[aside]))
@@ -89,7 +90,7 @@ class Problem:
         t[rows], hit[rows] = self._met(sdf, self.seen[rows], t[rows] - BACK)
         rows = (look.watched & ~self.seen.known).nonzero()[:, 0]
         seen = self.seen[rows]
-        t[rows], values = _lowest(sdf, seen, t[rows])
+        t[rows], values = _lowest(sdf, seen, t[rows], NEAR, ROUNDS_NEAR)
         hit[rows] = values <= 0
         compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
         self.evaluations += sdf.evaluations
@@ -137,5 +138,7 @@ class Problem:
         return {name: float(lacking[kind].sum()) for name, kind in kinds.items()} | {"code": float(code)}
 
 
-def _lowest(sdf: SDF, seen: Seen, t: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    return minimum_and_value(sdf, seen.rays, t, seen.bounds, reach=REACH, refine=ROUNDS)
+def _lowest(
+    sdf: SDF, seen: Seen, t: Float[Tensor, "n"], reach: float = REACH, rounds: int = ROUNDS
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    return minimum_and_value(sdf, seen.rays, t, seen.bounds, reach=reach, refine=rounds)
