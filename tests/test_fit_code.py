@@ -136,6 +136,20 @@ def test_continuing_from_the_last_hits_finds_what_a_whole_march_finds(decoder: D
     assert between - before < problem.evaluations - between, "at fewer evaluations"
 
 
+def test_rays_are_looked_along_again_where_the_scale_is_another(decoder: Decoder, view: View) -> None:
+    problem = problem_of(decoder, view, CONFIG.compared)
+    first = problem.look(torch.zeros(4))
+    asked = problem.evaluations
+    moved = problem.moved(first, torch.tensor([0.5, -0.2, 0.3, 0.1]))
+    before = problem.evaluations
+    assert problem.look(moved.w, moved) is moved
+    assert problem.evaluations == before
+    problem.scale /= 2
+    again, anew = problem.look(moved.w, moved), problem.look(moved.w)
+    assert (again.hit == anew.hit).float().mean() > 0.99
+    assert before < problem.evaluations < before + 2 * asked
+
+
 def test_the_best_end_is_brought_to_the_outline() -> None:
     """Of a silhouette alone: a few rays through pixels tell roughly where it is, rays between them exactly."""
     decoder = bumpy_balls(0.4)  # all of it is in the unit sphere: its outline is that of its surface

@@ -18,9 +18,9 @@ from distrace.rounded import quickest
 from distrace.surface import minimum_and_value
 from distrace.trace import TraceConfig, sphere_trace
 
-BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is not seen
+BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
-WATCHED = 0.075  # … and those that come closer than this after each step
+WATCHED = 0.075  # … and those that come closer than this after each step; the others when a scale changes
 REACH, ROUNDS = 0.05, 2  # to two thousandths, at first; …
 NEAR, ROUNDS_NEAR = 0.02, 1  # … a step moves it little
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
@@ -46,6 +46,7 @@ class Look:
     hit: Bool[Tensor, "n"]
     compared: Bool[Tensor, "n"]
     watched: Bool[Tensor, "n"]  # compared, or near to that: what a step may change
+    scale: float  # up to which deviations counted by their squares
 
 
 @dataclass
@@ -61,15 +62,17 @@ class Problem:
 
     @torch.no_grad()
     def look(self, w: Float[Tensor, "dimensions"], last: Look | None = None) -> Look:
-        """Along all rays, which have been looked along where there is a `last` one.
+        """Along all rays, and again if the scale is another: what ended on the surface is followed from there on.
 
         Of those without a depth the ones that disagree with the mask are compared, and those that touch the shape,
         where the field is least; those that are near to that are watched.
         """
-        if last is not None:
+        if last is not None and last.scale == self.scale:
             return last
-        sdf, seen = self._field(w), self.seen
-        t, hit = self._met(sdf, seen, seen.bounds.near)
+        sdf, seen, near = self._field(w), self.seen, self.seen.bounds.near
+        if last is not None:
+            near = torch.where(last.hit | seen.known, last.distance - BACK, near)
+        t, hit = self._met(sdf, seen, near)
         free = ~seen.known & ~seen.is_object & seen.bounds.meets
         aside = (free & ~hit).nonzero()[:, 0]
         values = sdf(seen.rays[aside].at(t[aside]))
@@ -79,7 +82,7 @@ class Problem:
         wrong = free | lacking
         t[wrong], _ = _lowest(sdf, seen[wrong], t[wrong])
         self.evaluations += sdf.evaluations
-        return Look(w, t, hit, seen.known | wrong, seen.known | close | lacking)
+        return Look(w, t, hit, seen.known | wrong, seen.known | close | lacking, self.scale)
 
     @torch.no_grad()
     def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
@@ -94,7 +97,7 @@ class Problem:
         hit[rows] = values <= 0
         compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
         self.evaluations += sdf.evaluations
-        return Look(w, t, hit, compared, look.watched)
+        return Look(w, t, hit, compared, look.watched, self.scale)
 
     def _field(self, w: Float[Tensor, "dimensions"]) -> Counted:
         """To look along rays by, rounded where that is faster; residuals are not."""
