@@ -46,7 +46,7 @@ class Look:
     hit: Bool[Tensor, "n"]
     compared: Bool[Tensor, "n"]
     watched: Bool[Tensor, "n"]  # compared, or near to that: what a step may change
-    scale: float  # up to which deviations counted by their squares
+    scale: float  # the problem's when all rays were looked along
 
 
 @dataclass
@@ -97,7 +97,7 @@ class Problem:
         hit[rows] = values <= 0
         compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
         self.evaluations += sdf.evaluations
-        return Look(w, t, hit, compared, look.watched, self.scale)
+        return Look(w, t, hit, compared, look.watched, look.scale)
 
     def _field(self, w: Float[Tensor, "dimensions"]) -> Counted:
         """To look along rays by, rounded where that is faster; residuals are not."""
