@@ -25,6 +25,7 @@ from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.files import alone
 from distrace.training.batches import Samples, load_samples
+from distrace.training.kept import Kept
 from distrace.training.resume import NAME, load_training, save_training
 from distrace.training.train import (
     Step,
@@ -266,15 +267,47 @@ def test_a_run_goes_on_at_the_rate_that_is_given(tmp_path: Path) -> None:
     assert rates == pytest.approx([0.01 * share, 0.03 * share])
 
 
-def test_a_run_that_dwells_needs_its_model_when_it_goes_on(tmp_path: Path, run, capsys) -> None:
+@pytest.mark.parametrize("option", [("--dwell", "3"), ("--keep", "0.5")])
+def test_a_run_that_looks_at_a_model_needs_it_when_it_goes_on(tmp_path: Path, run, capsys, option) -> None:
     samples, first, second = sample_files(tmp_path / "samples", 0.5), tmp_path / "first", tmp_path / "second"
     run("train", samples, "--out", first, *TINY[2:], "--steps", "3")
-    run("train", samples, "--out", second, "--begin-with", first, "--steps", "2", "--dwell", "3")
+    run("train", samples, "--out", second, "--begin-with", first, "--steps", "2", *option)
     with pytest.raises(SystemExit):
         run("train", samples, "--out", second, "--steps", "4")
     assert "add --begin-with" in capsys.readouterr().err
     run("train", samples, "--out", second, "--steps", "4", "--begin-with", first)
     assert checkpoint(second)["step"] == 4
+
+
+def test_a_model_stays_what_it_was_between_its_shapes_if_it_is_to(tmp_path: Path) -> None:
+    """Learning a larger sphere further moves the field at other codes; less so the more it counts."""
+    config = replace(CONFIG, steps=300, warm_up=10)
+    known = finished(spheres(0.3, 0.6), config)
+    save_experiment(tmp_path, known.decoder, known.codes, ("sphere0", "sphere1"))
+    kept = Kept.of(model := load_model(tmp_path), names := ["sphere0", "new", "sphere1"])
+    points, codes = torch.rand(50, 200, 3) - 0.5, kept.drawn(torch.arange(3).repeat(50)[:50])
+    changes = []
+    for keep in (0.0, 10.0):
+        training = start(3, SPECS, config, CPU)
+        begin_with(training, names, model)
+        for _ in train(replace(spheres(0.3, 0.45, 0.6), names=names), training, replace(config, keep=keep), kept):
+            pass
+        with torch.no_grad():
+            now = training.decoder.eval()(points, codes[:, None])
+        changes.append((now - kept.values(points, codes)).abs().mean())
+    assert changes[1] < changes[0] / 3
+
+
+def test_codes_at_which_a_model_is_kept_are_as_usual_as_its_own() -> None:
+    codes = 0.3 * torch.randn(40, 4, generator=torch.Generator().manual_seed(0)) + 1
+    kept = Kept.of(Model("some", Spheres(), codes, tuple(map(str, range(40)))), [*map(str, range(40)), "new"])
+    torch.testing.assert_close(kept.codes[40], codes.mean(0))
+    torch.manual_seed(0)
+    drawn = torch.cat([kept.drawn(torch.arange(40)) for _ in range(200)])
+    torch.testing.assert_close(drawn.mean(0), codes.mean(0), atol=0.02, rtol=0)
+    assert ((drawn.std(0) / codes.std(0) - 1.06).abs() < 0.1).all()  # the prior has a least deviation
+    nearness = torch.corrcoef(torch.stack([drawn[:, 3], codes[:, 3].repeat(200)]))[0, 1]
+    assert 0.35 < nearness < 0.55  # the mean of 0 to 0.9
 
 
 def test_a_folder_is_learnt_from_a_model_of_another_size(tmp_path: Path, run) -> None:

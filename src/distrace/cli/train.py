@@ -24,6 +24,7 @@ from distrace.render import render
 from distrace.shading import save_png, side_by_side
 from distrace.training.batches import Samples, load_samples
 from distrace.training.course import COURSE
+from distrace.training.kept import Kept
 from distrace.training.resume import load_training, save_training
 from distrace.training.train import TrainConfig, Training, begin_with, faster_in_bfloat16
 from distrace.training.train import start as start_training
@@ -48,6 +49,7 @@ class Train:
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
     large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
     dwell: int | None = None  # 1; times a sample is drawn near places that --begin-with has on the wrong side
+    keep: float | None = None  # 0; × as much as samples counts that --begin-with stays as it is between its shapes
     variant_weight: float | None = None  # 0.5; how often a variant, or what was invented, is drawn, to once the others
     learning_rate: float | None = None  # 0.001; less where a model is learnt further
     samples_per_step: int | None = None  # 2,048
@@ -72,24 +74,19 @@ class Train:
         """All of it, from samples to the run's result."""
         folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
         loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
+        known = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
+        config = self._prolonged(*resumed) if resumed else self._fresh()
+        kept = self._kept(config, known, loaded.names)
         if resumed:
-            training, config = resumed
-            self._check_same(training, config)
-            config = self._changed(config)
+            training = resumed[0]
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
-            known = None if self.begin_with is None else opened(self.begin_with, run.device)
-            specs = self._specs(known)
-            config = replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
-            config = replace(config, bfloat16=faster_in_bfloat16(specs, run.device))
-            training = start_training(len(loaded.names), specs, config, run.device)
-            if known is not None:
-                begin_with(training, loaded.names, known)
-            config = config if self.minutes is None else _as_long_as(self.minutes, loaded, specs, config, run.device)
-        if config.dwell > 1:
-            loaded = self._dwelling(loaded, config.dwell, run.device)
-        loss = _run(run, loaded, training, config, saving)
+            training, config = self._begun(loaded, config, known, kept, run.device)
+        if known is not None and config.dwell > 1:
+            console.print(f"looking where {known.name} is wrong")
+            loaded = dwelling(loaded, known, config.dwell)
+        loss = _run(run, loaded, training, config, kept, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
@@ -110,20 +107,40 @@ class Train:
             raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
         return replace(specs, norm_layers=tuple(range(len(specs.dims))), weight_norm=True)
 
-    def _dwelling(self, loaded: Samples, times: int, device: torch.device) -> Samples:
-        if self.begin_with is None:
-            raise ValueError(f"{self.out} dwells on what a model has wrong, and no model was given; add --begin-with")
-        console.print(f"looking where {self.begin_with} is wrong")
-        return dwelling(loaded, opened(self.begin_with, device), times)
+    def _fresh(self) -> TrainConfig:
+        return replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
+
+    def _begun(
+        self, samples: Samples, config: TrainConfig, known: Model | None, kept: Kept | None, device: torch.device
+    ) -> tuple[Training, TrainConfig]:
+        """A run at its first step, and for how many steps."""
+        specs = self._specs(known)
+        config = replace(config, bfloat16=faster_in_bfloat16(specs, device))
+        training = start_training(len(samples.names), specs, config, device)
+        if known is not None:
+            begin_with(training, samples.names, known)
+        if self.minutes is not None:
+            config = _as_long_as(self.minutes, samples, specs, config, kept, device)
+        return training, config
+
+    def _kept(self, config: TrainConfig, known: Model | None, names: list[str]) -> Kept | None:
+        """What is to stay of the model that is learnt further. Raises `ValueError` where none was given and one is."""
+        if known is not None:
+            return Kept.of(known, names) if config.keep else None
+        if config.dwell > 1 or config.keep:
+            raise ValueError(
+                f"{self.out} is taught what a model has wrong or is to keep; add --begin-with and the model"
+            )
+        return None
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
         """What was said replaces defaults, and what a run had before."""
-        said = _said(self, "steps", "wrong_sign", "large", "dwell", "variant_weight", "learning_rate")
+        said = _said(self, "steps", "wrong_sign", "large", "dwell", "keep", "variant_weight", "learning_rate")
         if self.learning_rate is not None:
             said["code_learning_rate"] = 2 * self.learning_rate
         return replace(config, **said)
 
-    def _check_same(self, training: Training, config: TrainConfig) -> None:
+    def _prolonged(self, training: Training, config: TrainConfig) -> TrainConfig:
         """Raises `ValueError` where something was said that a run which goes on has otherwise, or did already."""
         specs = training.decoder.specs
         has = {"samples_per_step": config.samples_per_step, "seed": config.seed, "code_length": specs.code_length}
@@ -138,6 +155,7 @@ class Train:
             raise ValueError(
                 f"--steps {self.steps} was given, but the run in {self.out} has done {training.step} already"
             )
+        return self._changed(config)
 
 
 def _said(command: Train, *names: str) -> dict[str, Any]:
@@ -169,19 +187,21 @@ def _sample_files(folder: Path, split: str | None) -> list[Path]:
 
 
 def _as_long_as(
-    minutes: float, samples: Samples, specs: NetworkSpecs, config: TrainConfig, device: torch.device
+    minutes: float, samples: Samples, specs: NetworkSpecs, config: TrainConfig, kept: Kept | None, device: torch.device
 ) -> TrainConfig:
     """The configuration with as many steps as fit into the time, by the median of a few on a training of their own."""
     trial = start_training(len(samples.names), specs, config, device)
-    seconds = sorted(step.seconds for step in run_training(samples, trial, replace(config, steps=TRIED)))
+    seconds = sorted(step.seconds for step in run_training(samples, trial, replace(config, steps=TRIED), kept))
     return replace(config, steps=max(int(minutes * 60 / seconds[TRIED // 2]), TRIED))
 
 
-def _run(run: Run, samples: Samples, training: Training, config: TrainConfig, saving: Every) -> float:
+def _run(
+    run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None, saving: Every
+) -> float:
     """Trains to the end, saving now and then; the mean loss of the last steps."""
     loss = training.losses[-1] if training.losses else math.nan
     with progress("training", config.steps) as bar:
-        for step in run_training(samples, training, config):
+        for step in run_training(samples, training, config, kept):
             if not math.isfinite(step.loss):
                 raise ValueError(
                     f"the training has diverged at step {step.step}; {run.out} has what was saved before. Let wrong"

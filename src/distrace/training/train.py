@@ -15,6 +15,7 @@ from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.training.batches import Samples
 from distrace.training.course import record
+from distrace.training.kept import Kept
 from distrace.training.recorded import Recorded
 
 
@@ -35,6 +36,7 @@ class TrainConfig:
     wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
     large: float = torch.inf  # errors above count by their squares: what fills gaps is far off, and rare
     dwell: int = 1  # times a sample is drawn where the network it began with has signs wrong, to once elsewhere
+    keep: float = 0.0  # × as much as samples counts that the field between codes stays what it was
     code_penalty: float = 1e-4
     code_bound: float = 1.0
     code_deviation: float = 0.05  # of a code's entries at the start
@@ -53,6 +55,10 @@ class TrainConfig:
             given = f"a rate of {self.learning_rate:g}, variants at {self.variant_weight:g}, places {self.dwell} times"
             needed = "a rate above 0, a share above 0 and up to 1, and a whole number from 1"
             raise ValueError(f"{given} were asked for; {needed} are needed")
+        if not 0 <= self.keep < math.inf:
+            raise ValueError(
+                f"to keep a model {self.keep:g} times as much was asked for; 0 or a number above is needed"
+            )
 
 
 @dataclass
@@ -103,12 +109,13 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
     training.codes.copy_(torch.stack([known.get(name, model.codes.mean(0)) for name in names]))
 
 
-def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator[Step]:
+def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept | None = None) -> Iterator[Step]:
     """Trains in place and yields after every step, from wherever `training` is to the last one.
 
-    The draw of a step depends on the seed and the step alone: a run that was stopped goes on as if it had not been.
+    What is `kept` counts `config.keep` times. The draw of a step depends on the seed and the step alone: a run that was
+    stopped goes on as if it had not been.
     """
-    device, step = training.codes.device, partial(_step, training, config)
+    device, step = training.codes.device, partial(_step, training, config, kept)
     training.decoder.train()
     _prepare(training.optimiser, device)
     if device.type == "cuda":
@@ -119,18 +126,31 @@ def train(samples: Samples, training: Training, config: TrainConfig) -> Iterator
         _set_rates(training.optimiser, (share * config.learning_rate, share * config.code_learning_rate))
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = samples.drawn(config.shapes_per_step, config.samples_per_step, config.variant_weight)
-        training.record(loss := step(shapes.to(device), batch).item())
+        between = () if kept is None else (kept.drawn(shapes),)
+        training.record(loss := step(shapes.to(device), batch, *between).item())
         yield Step(training.step, loss, time.perf_counter() - began)
 
 
-def _step(training: Training, config: TrainConfig, shapes: Tensor, batch: Float[Tensor, "shapes n 4"]) -> Tensor:
-    """A step on the samples drawn; their loss."""
+def _step(
+    training: Training,
+    config: TrainConfig,
+    kept: Kept | None,
+    shapes: Tensor,
+    batch: Float[Tensor, "shapes n 4"],
+    between: Float[Tensor, "shapes length"] | None = None,
+) -> Tensor:
+    """A step on the samples drawn, and at half of their points on the codes between; the loss of the samples."""
     codes = training.codes.index_select(0, shapes)
+    rest = config.code_penalty * codes.square().sum(-1).mean()
     with torch.autocast(batch.device.type, torch.bfloat16, enabled=config.bfloat16, cache_enabled=False):
         values = training.decoder(batch[..., :3], codes[:, None])
+        if kept is not None and between is not None:
+            points = batch[:, ::2, :3]
+            now, before = training.decoder(points, between[:, None]), kept.values(points, between)
+            rest = rest + config.keep * clamped_loss(now.float(), before.float(), config.clamp)
     loss = training_loss(values.float(), batch[..., 3], config)
     training.optimiser.zero_grad()
-    (loss + config.code_penalty * codes.square().sum(-1).mean()).backward()
+    (loss + rest).backward()
     training.optimiser.step()
     bound_codes(training.codes, config.code_bound)
     return loss.detach()
