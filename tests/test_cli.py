@@ -17,7 +17,7 @@ from PIL import Image
 from test_train import SPECS, of_sphere, spheres
 
 import distrace.cli
-import distrace.cli.train
+import distrace.cli.train_samples
 import distrace.movie
 from distrace import metrics
 from distrace.camera import Camera
@@ -29,7 +29,8 @@ from distrace.evaluation import evaluate, sparse_depth, spread_table, training_c
 from distrace.mesh import MeshConfig
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
-from distrace.training.train import TrainConfig, start, train
+from distrace.training.config import TrainConfig
+from distrace.training.train import start, train
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}
@@ -247,8 +248,8 @@ def test_complete_takes_points_and_says_what_else_would_fit(model: Path, run: Co
 def test_train_samples_a_folder_of_meshes_first(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").mkdir()
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "mine" / "box.ply")
-    monkeypatch.setattr(distrace.cli.train, "MESH_SAMPLES", 2000)
-    monkeypatch.setattr(distrace.cli.train.os, "cpu_count", lambda: 1)
+    monkeypatch.setattr(distrace.cli.train_samples, "MESH_SAMPLES", 2000)
+    monkeypatch.setattr(distrace.cli.train_samples.os, "cpu_count", lambda: 1)
     size = ("--layers", 2, "--width", 16, "--code-length", 4)
     run("train", tmp_path / "mine", "--steps", 3, *size, "--out", tmp_path / "model")
     assert load_model(tmp_path / "model").shapes == ("box", "box~warped1", "box~warped2")

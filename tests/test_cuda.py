@@ -7,7 +7,8 @@ import torch
 from test_train import CONFIG, SPECS, spheres
 
 from distrace.training import train as training
-from distrace.training.train import TrainConfig, start, train
+from distrace.training.config import TrainConfig
+from distrace.training.train import start, train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 

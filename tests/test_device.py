@@ -24,7 +24,7 @@ from distrace.fitting.fit_samples import SampleFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of
 from distrace.pages import views_page
 from distrace.render import render
-from distrace.training.train import TrainConfig
+from distrace.training.config import TrainConfig
 
 Command = Callable[..., None]
 

@@ -8,7 +8,7 @@ import pytest
 import trimesh
 from manifold3d import Manifold, OpType
 
-from distrace.cli.train import _sample_files
+from distrace.cli.train_samples import sample_files
 from distrace.data.inventing import INVENTORS, invented
 from distrace.data.inventing.foot import foot
 from distrace.data.inventing.parts import Part, block, bowed, disc, rod, row, sheet, tilted
@@ -150,5 +150,5 @@ def test_what_leans_backwards_has_its_top_behind() -> None:
 def test_a_split_is_learnt_with_what_was_invented_of_it(tmp_path: Path) -> None:
     for name in ("armchair-cc0", "armchair-cc0~warped1", "cafe-chair", "chairs~1", "sofas~1"):
         (tmp_path / f"{name}.npz").touch()
-    names = [path.stem for path in _sample_files(tmp_path, "chairs")]
+    names = [path.stem for path in sample_files(tmp_path, tmp_path, "chairs")]
     assert names == ["armchair-cc0", "armchair-cc0~warped1", "chairs~1"]  # cafe-chair is held out

@@ -25,18 +25,11 @@ from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.files import alone
 from distrace.training.batches import Samples, load_samples
+from distrace.training.config import TrainConfig
 from distrace.training.kept import Kept
+from distrace.training.losses import training_loss
 from distrace.training.resume import NAME, load_training, save_training
-from distrace.training.train import (
-    Step,
-    TrainConfig,
-    Training,
-    begin_with,
-    bound_codes,
-    start,
-    train,
-    training_loss,
-)
+from distrace.training.train import Step, Training, begin_with, bound_codes, start, train
 from distrace.training.wrong_places import CERTAIN, REACH, dwelling
 
 CPU = torch.device("cpu")

@@ -1,7 +1,6 @@
 """`train`: from samples to a model, going on where it was stopped."""
 
 import math
-import os
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,7 @@ import tyro
 from distrace.checkpoint import Model, save_experiment
 from distrace.cli.common import Every, opened
 from distrace.cli.console import Run, console, progress, start
-from distrace.cli.data import sampled
-from distrace.data import sampling
-from distrace.data.split import every_mesh, has_meshes, on_side
+from distrace.cli.train_samples import sample_files
 from distrace.decoder import NetworkSpecs
 from distrace.evaluation.bench import poster_view
 from distrace.files import alone
@@ -23,10 +20,11 @@ from distrace.pages.report import View
 from distrace.render import render
 from distrace.shading import save_png, side_by_side
 from distrace.training.batches import Samples, load_samples
+from distrace.training.config import TrainConfig
 from distrace.training.course import COURSE
 from distrace.training.kept import Kept
 from distrace.training.resume import load_training, save_training
-from distrace.training.train import TrainConfig, Training, begin_with, faster_in_bfloat16
+from distrace.training.train import Training, begin_with, faster_in_bfloat16
 from distrace.training.train import start as start_training
 from distrace.training.train import train as run_training
 from distrace.training.wrong_places import dwelling
@@ -34,7 +32,6 @@ from distrace.training.wrong_places import dwelling
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
 TRIED = 20  # steps that tell how many fit into --minutes
 PREVIEWED = 5
-MESH_SAMPLES = 200_000  # of each mesh that is not sampled yet
 
 
 @dataclass(frozen=True)
@@ -72,8 +69,7 @@ class Train:
 
     def _learn(self, run: Run, saving: Every) -> None:
         """All of it, from samples to the run's result."""
-        folder = self.samples if _has_samples(self.samples) else _sampled_meshes(self.samples, self.out / "samples")
-        loaded = load_samples(_sample_files(folder, self.split)).to(run.device)
+        loaded = load_samples(sample_files(self.samples, self.out, self.split)).to(run.device)
         known = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         config = self._prolonged(*resumed) if resumed else self._fresh()
@@ -161,29 +157,6 @@ class Train:
 def _said(command: Train, *names: str) -> dict[str, Any]:
     """Options that were given."""
     return {name: getattr(command, name) for name in names if getattr(command, name) is not None}
-
-
-def _has_samples(folder: Path) -> bool:
-    return any(folder.glob("*.npz")) or not has_meshes(folder)
-
-
-def _sampled_meshes(meshes: Path, out: Path) -> Path:
-    """Every mesh below a folder sampled, with its mirror image and two warped copies."""
-    todo = sampling.jobs(every_mesh(meshes), meshes, out, MESH_SAMPLES, mirror=True, variants=2)
-    if not any(report.usable for report in sampled(todo, os.cpu_count() or 1)):
-        raise ValueError(f"no mesh in {meshes} bounds a solid; there is nothing to learn")
-    return out
-
-
-def _sample_files(folder: Path, split: str | None) -> list[Path]:
-    paths = sorted(folder.glob("*.npz"))
-    if split:
-        wanted = {split, *(shape.name for shape in on_side("train", split))}  # what was invented is called sofas~1
-        paths = [path for path in paths if path.stem.split("~")[0] in wanted]
-    if not paths:
-        what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"
-        raise ValueError(f"{folder} {what}; `distrace sample` makes them")
-    return paths
 
 
 def _as_long_as(

@@ -12,7 +12,8 @@ from distrace.data.split import on_side
 from distrace.decoder import NetworkSpecs
 from distrace.evaluation.evaluate import held_out_results, training_results
 from distrace.training.batches import load_samples
-from distrace.training.train import TrainConfig, faster_in_bfloat16, start, train
+from distrace.training.config import TrainConfig
+from distrace.training.train import faster_in_bfloat16, start, train
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs((256,) * 8, code_length=128)

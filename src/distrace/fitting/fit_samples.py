@@ -10,7 +10,7 @@ from torch import Tensor
 
 from distrace.decoder import Decoder
 from distrace.fitting.starts import Step
-from distrace.training.train import clamped_loss
+from distrace.training.losses import clamped_loss
 
 
 @dataclass(frozen=True)

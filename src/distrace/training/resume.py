@@ -9,8 +9,9 @@ import torch
 from distrace.decoder import NetworkSpecs
 from distrace.errors import explained
 from distrace.files import written
+from distrace.training.config import TrainConfig
 from distrace.training.course import COURSE
-from distrace.training.train import TrainConfig, Training, start
+from distrace.training.train import Training, start
 
 NAME = "checkpoint.pt"
 

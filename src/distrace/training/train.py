@@ -1,6 +1,5 @@
 """Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
 
-import math
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,51 +13,11 @@ from torch.nn.utils.parametrize import is_parametrized
 from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.training.batches import Samples
+from distrace.training.config import TrainConfig
 from distrace.training.course import record
 from distrace.training.kept import Kept
+from distrace.training.losses import clamped_loss, training_loss
 from distrace.training.recorded import Recorded
-
-
-@dataclass(frozen=True)
-class TrainConfig:
-    """The schedule: a short warm-up, a constant rate, and a straight line down to zero at `steps`."""
-
-    steps: int = 36_000
-    samples_per_step: int = 2048  # half of them outside; small and many steps beat large and few, minute for minute
-    shapes_per_step: int = 64
-    learning_rate: float = 1e-3
-    code_learning_rate: float = 2e-3
-    warm_up: int = 500  # steps
-    cool_down: float = (
-        0.4  # share of the steps; until it begins, a run can be given more steps as if it had them always
-    )
-    clamp: float = 0.1  # distances beyond are learnt as "far"
-    wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
-    large: float = torch.inf  # errors above count by their squares: what fills gaps is far off, and rare
-    dwell: int = 1  # times a sample is drawn where the network it began with has signs wrong, to once elsewhere
-    keep: float = 0.0  # × as much as samples counts that the field between codes stays what it was
-    code_penalty: float = 1e-4
-    code_bound: float = 1.0
-    code_deviation: float = 0.05  # of a code's entries at the start
-    variant_weight: float = 0.5  # how often a variant, whose name has a ~, is drawn, to once an original
-    bfloat16: bool = False
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        if self.steps < 1 or self.samples_per_step < 1 or not 0 <= self.seed < 2**31:
-            given = f"{self.steps} steps of {self.samples_per_step} samples with seed {self.seed}"
-            raise ValueError(f"{given} were asked for; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
-        if not (self.wrong_sign > 0 and self.large > 0):
-            given = f"a wrong sign {self.wrong_sign:g} times as much, and errors above {self.large:g} squared"
-            raise ValueError(f"{given} were asked for; both must be above 0")
-        if not (0 < self.learning_rate < math.inf and 0 < self.variant_weight <= 1 and self.dwell >= 1):
-            given = f"a rate of {self.learning_rate:g}, variants at {self.variant_weight:g}, places {self.dwell} times"
-            needed = "a rate above 0, a share above 0 and up to 1, and a whole number from 1"
-            raise ValueError(f"{given} were asked for; {needed} are needed")
-        if not 0 <= self.keep < math.inf:
-            raise ValueError(
-                f"to keep a model {self.keep:g} times as much was asked for; 0 or a number above is needed"
-            )
 
 
 @dataclass
@@ -169,27 +128,6 @@ def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
             group["lr"].fill_(rate)  # a recorded step reads it where it lies
         else:
             group["lr"] = rate
-
-
-def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:
-    """The clamped loss where samples that matter for the shape, but are few, count more.
-
-    Those with a wrong sign are what thin parts are lost by (cf. Duan et al., *Curriculum DeepSDF*, ECCV 2020, section
-    3.2); large errors, of a reverse Huber loss (Laina et al., 3DV 2016, section 3.2), what gaps are filled by.
-    """
-    off, limit = clamped_error(values, distances, config.clamp), config.large
-    if limit < torch.inf:
-        off = torch.where(off > limit, (off.square() + limit**2) / (2 * limit), off)
-    return (torch.where(values * distances < 0, config.wrong_sign, 1.0) * off).mean()
-
-
-def clamped_loss(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
-    """Mean |clamp(f) − clamp(d)| (Park et al. 2019, eq. 4)."""
-    return clamped_error(values, distances, clamp).mean()
-
-
-def clamped_error(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
-    return (values.clamp(-clamp, clamp) - distances.clamp(-clamp, clamp)).abs()
 
 
 @torch.no_grad()

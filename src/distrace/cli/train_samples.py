@@ -1,0 +1,32 @@
+"""What `train` learns from: files of samples, or meshes that are sampled first."""
+
+import os
+from pathlib import Path
+
+from distrace.cli.data import sampled
+from distrace.data import sampling
+from distrace.data.split import every_mesh, has_meshes, on_side
+
+MESH_SAMPLES = 200_000  # of each mesh
+
+
+def sample_files(given: Path, out: Path, split: str | None) -> list[Path]:
+    """Files of a folder of samples, those of a split if one is named; of a folder of meshes, sampled below `out`."""
+    has_samples = any(given.glob("*.npz")) or not has_meshes(given)
+    folder = given if has_samples else _sampled_meshes(given, out / "samples")
+    paths = sorted(folder.glob("*.npz"))
+    if split:
+        wanted = {split, *(shape.name for shape in on_side("train", split))}  # what was invented is called sofas~1
+        paths = [path for path in paths if path.stem.split("~")[0] in wanted]
+    if not paths:
+        what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"
+        raise ValueError(f"{folder} {what}; `distrace sample` makes them")
+    return paths
+
+
+def _sampled_meshes(meshes: Path, out: Path) -> Path:
+    """Every mesh below a folder sampled, with its mirror image and two warped copies."""
+    todo = sampling.jobs(every_mesh(meshes), meshes, out, MESH_SAMPLES, mirror=True, variants=2)
+    if not any(report.usable for report in sampled(todo, os.cpu_count() or 1)):
+        raise ValueError(f"no mesh in {meshes} bounds a solid; there is nothing to learn")
+    return out
