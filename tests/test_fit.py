@@ -14,10 +14,10 @@ from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples
-from distrace.fitting.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.fitting.starts import Step
 from distrace.fitting.targets import OUTLINE, Pool, Targets
 from distrace.primitives import sphere
+from distrace.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render
 

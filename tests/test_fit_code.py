@@ -16,12 +16,12 @@ from distrace.fitting.code_residuals import Comparison, Problem
 from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.fitting.nearest import Hints, first_of
 from distrace.fitting.point_residuals import PointProblem, misfit
-from distrace.fitting.prior import Prior
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import SolverConfig, minimise
 from distrace.fitting.starts import Step, stages_of
 from distrace.fitting.targets import Pool
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.render import render
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)

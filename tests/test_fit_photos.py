@@ -14,7 +14,6 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
-from distrace.fitting.prior import Prior
 from distrace.photographs.choice import contradictions
 from distrace.photographs.doubtful import agreements
 from distrace.photographs.fit_photos import PhotoConfig, fit_photos
@@ -24,6 +23,7 @@ from distrace.photographs.residuals import PhotoProblem, Shape
 from distrace.photographs.search import Search
 from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
+from distrace.prior import Prior
 from distrace.rays import meet_sphere
 from distrace.render import render
 

@@ -8,7 +8,7 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
     *("threads", "errors", "files", "processes", "rays", "camera", "pose"),
-    *("field", "steepness", "primitives", "decoder", "rounded", "experiment", "checkpoint"),
+    *("field", "steepness", "primitives", "decoder", "rounded", "experiment", "checkpoint", "prior"),
     *("trace", "pyramid", "fast", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photographs", "reconstruction"),

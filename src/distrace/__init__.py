@@ -21,10 +21,10 @@ from distrace.fitting.fit import FitConfig as FitConfig
 from distrace.fitting.fit import fit_shape as fit_shape
 from distrace.fitting.fit_camera import CameraConfig as CameraConfig
 from distrace.fitting.fit_camera import fit_camera as fit_camera
-from distrace.fitting.prior import prior_of as prior_of
 from distrace.mesh import MeshConfig as MeshConfig
 from distrace.mesh import extract_mesh as extract_mesh
 from distrace.metrics import chamfer as chamfer
+from distrace.prior import prior_of as prior_of
 from distrace.rays import Bounds as Bounds
 from distrace.rays import Rays as Rays
 from distrace.rays import meet_sphere as meet_sphere

@@ -20,11 +20,11 @@ from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.plausible import plausible, spread
-from distrace.fitting.prior import prior_of
 from distrace.fitting.starts import Step
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import Chamfer, chamfer
 from distrace.pages import report
+from distrace.prior import prior_of
 from distrace.render import render
 
 Surface = trimesh.Trimesh | np.ndarray

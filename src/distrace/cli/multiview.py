@@ -14,7 +14,6 @@ from distrace.cli.common import Flag, ModelName, Views, opened, save_mesh
 from distrace.cli.console import console, progress, start
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text, written
-from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
 from distrace.pages.views_page import forming, views_page
@@ -22,6 +21,7 @@ from distrace.photographs.doubtful import Agreement, agreements
 from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing
+from distrace.prior import prior_of
 
 
 @dataclass(frozen=True)

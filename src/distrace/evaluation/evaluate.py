@@ -18,10 +18,10 @@ from distrace.evaluation.bench import poster_view
 from distrace.fitting.code_residuals import Comparison
 from distrace.fitting.fit_code import CodeFitConfig, fit_points
 from distrace.fitting.methods import METHODS, steps_of
-from distrace.fitting.prior import prior_of
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
+from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 
 OBSERVATION_SIZE = 256

@@ -29,13 +29,13 @@ from distrace.evaluation.sparse_depth import fingerprint, hash_of, true_solid
 from distrace.evaluation.trials import grouped, opened_once, read_json
 from distrace.files import save_json, written
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
-from distrace.fitting.prior import prior_of
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
 from distrace.photographs.search import Search
 from distrace.photographs.stage import Stage
 from distrace.pose import Similarity
+from distrace.prior import prior_of
 
 METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")
 MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size

@@ -18,11 +18,11 @@ from distrace.evaluation.evaluate import OBSERVATION_SIZE
 from distrace.fitting.code_residuals import Comparison
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
-from distrace.fitting.prior import Prior, prior_of
 from distrace.fitting.starts import Step
 from distrace.fitting.targets import Pool
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
+from distrace.prior import Prior, prior_of
 
 ADAM = FitConfig(iterations=200, starts=1)
 # Adam's own loss, far down

@@ -9,10 +9,10 @@ from torch import Tensor
 from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
 from distrace.fitting.by_code import derivatives, with_prior
-from distrace.fitting.prior import Prior
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Residuals
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.rays import Bounds
 from distrace.rounded import quickest
 from distrace.surface import minimum_and_value

@@ -12,10 +12,10 @@ from distrace import losses
 from distrace.data.view import View
 from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
-from distrace.fitting.prior import Prior
 from distrace.fitting.starts import Starts, Step, best_of
 from distrace.fitting.targets import Pool, Targets
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.render import render_rays
 from distrace.trace import TraceConfig
 

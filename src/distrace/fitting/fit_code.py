@@ -18,13 +18,13 @@ from distrace.fitting.code_residuals import Comparison, Problem
 from distrace.fitting.fit import pools_of
 from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
-from distrace.fitting.prior import Prior
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, stages_of
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.losses import Weights
+from distrace.prior import Prior
 from distrace.rounded import quickest
 
 ProblemOf = Callable[[torch.Generator, float], Problem | PointProblem]

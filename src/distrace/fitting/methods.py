@@ -9,8 +9,8 @@ from distrace.data.view import View
 from distrace.fitting.fit import FitConfig, fit_shape
 from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples, on_surface
-from distrace.fitting.prior import Prior, prior_of
 from distrace.fitting.starts import Step
+from distrace.prior import Prior, prior_of
 
 METHODS = ("deepsdf", "ours", "ours+mask")  # of the published table
 CLOUDS = ("points", "points+normals")  # ours, not knowing the camera

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.decoder import FAR, Decoder
-from distrace.fitting.prior import Prior
 from distrace.fitting.seen import Seen
+from distrace.prior import Prior
 from distrace.rounded import Rounded, quickest
 
 DEPTHS, SILHOUETTE = 100, 300  # rays of a view that hints are taken from

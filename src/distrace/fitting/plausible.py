@@ -17,8 +17,8 @@ from distrace.data.view import View
 from distrace.decoder import FAR
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
-from distrace.fitting.prior import DEVIATION, Prior, prior_of
 from distrace.fitting.starts import Step
+from distrace.prior import DEVIATION, Prior, prior_of
 
 CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0, sharpening=0)
 

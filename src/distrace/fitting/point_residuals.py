@@ -9,10 +9,10 @@ from torch import Tensor
 from distrace.decoder import FAR, Decoder
 from distrace.field import SDF
 from distrace.fitting.by_code import derivatives, with_prior
-from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals
 from distrace.fitting.targets import drawn
 from distrace.losses import Weights
+from distrace.prior import Prior
 
 LOOKED = 20_000  # points at most that are asked whether they say something
 

@@ -6,9 +6,9 @@ from collections.abc import Sequence
 import torch
 
 from distrace.decoder import Decoder
-from distrace.fitting.prior import Prior
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing, Stage
+from distrace.prior import Prior
 
 SLIGHT = 1e-6  # of either: a shape whose outlines are all right is still judged by its colours
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
-from distrace.fitting.prior import Prior
 from distrace.photographs.residuals import Look, PhotoProblem, Shape
 from distrace.photographs.stage import Comparing, Stage
+from distrace.prior import Prior
 
 LEVEL = 0.5  # of the images' size
 FAR_OFF = 2.5  # × the median over views: farther off than that, a view is doubtful …

@@ -13,7 +13,6 @@ import torch
 
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
-from distrace.fitting.prior import Prior
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
 from distrace.fitting.starts import Starts, Step, best_of, stages_of
 from distrace.photographs.choice import contradictions
@@ -21,6 +20,7 @@ from distrace.photographs.residuals import Shape
 from distrace.photographs.search import Search
 from distrace.photographs.stage import Comparing, Stage
 from distrace.pose import Similarity
+from distrace.prior import Prior
 
 APPROACH = -1  # its steps' start
 

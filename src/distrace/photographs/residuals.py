@@ -16,10 +16,10 @@ from torch import Tensor
 from distrace.decoder import Decoder
 from distrace.field import Counted
 from distrace.fitting.by_code import SMALL, derivatives
-from distrace.fitting.prior import Prior
 from distrace.fitting.solver import Residuals, charbonnier
 from distrace.photographs.pairs import Colours
 from distrace.pose import Similarity
+from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
 from distrace.trace import TraceConfig, sphere_trace

@@ -9,11 +9,11 @@ import torch
 
 from distrace.decoder import Decoder
 from distrace.field import Counted
-from distrace.fitting.prior import Prior
 from distrace.photographs.residuals import Shape
 from distrace.photographs.stage import Comparing, Stage
 from distrace.photographs.whereabouts import whereabouts
 from distrace.pose import Similarity
+from distrace.prior import Prior
 
 SCREENED = 400  # rays on which all training shapes are compared, …
 COMPARED = 1000  # … and those on which the best of them are: one in so many, and no fewer than

@@ -10,13 +10,13 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
-from distrace.fitting.prior import Prior
 from distrace.fitting.targets import drawn
 from distrace.photographs.consensus import Consensus
 from distrace.photographs.pairs import Colours, partners, without_light
 from distrace.photographs.regions import Regions, appearance
 from distrace.photographs.residuals import MARCH, Look, PhotoProblem, PhotoWeights, Shape, Sightings
 from distrace.pose import Similarity
+from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import normals
 from distrace.trace import Trace, sphere_trace

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from distrace.checkpoint import Model
 from distrace.decoder import Decoder
-from distrace.fitting.prior import Prior, prior_of
+from distrace.prior import Prior, prior_of
 
 NEAREST = 0.9  # correlation with a code that is learnt, at most: there samples tell
 
