@@ -303,6 +303,15 @@ def test_codes_at_which_a_model_is_kept_are_as_usual_as_its_own() -> None:
     assert 0.35 < nearness < 0.55  # the mean of 0 to 0.9
 
 
+def test_a_model_of_another_size_cannot_be_kept(tmp_path: Path, run, capsys) -> None:
+    samples, first, second = sample_files(tmp_path / "samples", 0.5), tmp_path / "first", tmp_path / "second"
+    run("train", samples, "--out", first, *TINY[2:], "--steps", "3")
+    run("train", samples, "--out", second, "--begin-with", first, "--steps", "2", "--keep", "1")
+    with pytest.raises(SystemExit):
+        run("train", samples, "--out", second, "--begin-with", "sofas", "--steps", "3")
+    assert "it began with another" in capsys.readouterr().err
+
+
 def test_a_folder_is_learnt_from_a_model_of_another_size(tmp_path: Path, run) -> None:
     samples, first = sample_files(tmp_path / "samples", 0.5), tmp_path / "first"
     run("train", samples, "--out", first, *TINY[2:], "--steps", "3")

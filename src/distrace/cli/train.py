@@ -76,6 +76,10 @@ class Train:
         kept = self._kept(config, known, loaded.names)
         if resumed:
             training = resumed[0]
+            if kept and kept.codes.shape != training.codes.shape:
+                raise ValueError(
+                    f"the run in {self.out} has longer or shorter codes than {self.begin_with}; it began with another"
+                )
             console.print(f"going on from step {training.step} of {config.steps}")
         else:
             training, config = self._begun(loaded, config, known, kept, run.device)
