@@ -5,6 +5,7 @@ A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParam
 """
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from importlib.resources import files
 from pathlib import Path
@@ -47,6 +48,11 @@ class Model:
     def code_of(self, shape: str) -> Float[Tensor, "length"]:
         """Of a shape that it was trained on, by name."""
         return self.codes[self.shapes.index(shape)]
+
+    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
+        """By name; of shapes that it was not trained on, the mean code."""
+        known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
+        return torch.stack([known.get(shape, mean) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)

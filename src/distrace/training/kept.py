@@ -27,10 +27,8 @@ class Kept:
 
     @staticmethod
     def of(model: Model, names: Sequence[str]) -> "Kept":
-        """Of shapes that the model does not know, the mean code."""
-        known = dict(zip(model.shapes, model.codes, strict=True))
-        mean = model.codes.mean(0)
-        return Kept(model.decoder, torch.stack([known.get(name, mean) for name in names]), prior_of(model.codes))
+        """About what the model knows of shapes of these names."""
+        return Kept(model.decoder, model.codes_of(names), prior_of(model.codes))
 
     def drawn(self, shapes: Int[Tensor, "some"]) -> Float[Tensor, "some length"]:
         """For each of the shapes a code anywhere between its own and a draw of the prior, and as usual as both."""

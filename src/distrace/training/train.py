@@ -64,8 +64,7 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
         else:
             own.weight.copy_(learnt.weight)
         own.bias.copy_(learnt.bias)
-    known = dict(zip(model.shapes, model.codes, strict=True))
-    training.codes.copy_(torch.stack([known.get(name, model.codes.mean(0)) for name in names]))
+    training.codes.copy_(model.codes_of(names))
 
 
 def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept | None = None) -> Iterator[Step]:
