@@ -21,7 +21,7 @@ from distrace.fitting import methods
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.fit_samples import SampleFitConfig
-from distrace.fitting.methods import CLOUDS, METHODS, steps_of
+from distrace.fitting.methods import CLOUDS, METHODS, steps_of, told
 from distrace.pages import views_page
 from distrace.render import render
 from distrace.training.config import TrainConfig
@@ -93,7 +93,7 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
     monkeypatch.setattr(methods, "DEEPSDF", SampleFitConfig(samples=100, iterations=3))
     for config in (CodeFitConfig(iterations=1, starts=1, stages=1), FitConfig(iterations=2, starts=1)):
         with pretended(monkeypatch):
-            *_, last = steps_of(load_model(model).to("meta"), view, method, config)
+            *_, last = steps_of(load_model(model).to("meta"), told(view, method), method, config)
             assert last.code.device == DEVICE
             assert last.code.cpu().isfinite().all()
 

@@ -16,12 +16,13 @@ from distrace.data.cloud import Cloud
 from distrace.data.view import View
 from distrace.evaluation.bench import poster_view
 from distrace.files import written
+from distrace.fitting.consistent import completed
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.plausible import plausible, spread
 from distrace.fitting.starts import Step
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig
 from distrace.metrics import Chamfer, chamfer
 from distrace.pages import report
 from distrace.prior import prior_of
@@ -50,6 +51,9 @@ class Task:
         """That of the view; clouds are shown from in front and above."""
         return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
 
+    def surface(self, step: Step) -> trimesh.Trimesh:
+        return completed(self.model.field(step.code), self.known, self.mesh)
+
     def shown(self, seen: View | Cloud) -> View:
         return seen.seen_from(self.camera) if isinstance(seen, Cloud) else seen
 
@@ -77,8 +81,7 @@ def complete(run: Run, task: Task) -> None:
     outcome = _outcome(task, steps)
     save_mesh(run.out / "mesh.ply", outcome.mesh)
     for step in outcome.others:
-        mesh = extract_mesh(task.model.field(step.code), task.mesh)
-        save_mesh(run.out / f"plausible-{step.start + 1}.ply", mesh)
+        save_mesh(run.out / f"plausible-{step.start + 1}.ply", task.surface(step))
     page = _story(task, outcome)
     shading.save_png(run.out / "shaded.png", page.after.shaded)
     with written(run.out / "report.html") as file:
@@ -103,7 +106,7 @@ def _fitted(task: Task) -> list[Step]:
 def _outcome(task: Task, steps: list[Step]) -> Outcome:
     """The surface, and what else fits. Raises `ValueError` for a field without a zero."""
     others = list(_others(task))
-    mesh = extract_mesh(task.model.field(steps[-1].code), task.mesh)
+    mesh = task.surface(steps[-1])
     if others and len(mesh.faces):
         codes = [step.code for step in others]
         vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)

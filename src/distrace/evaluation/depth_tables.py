@@ -7,13 +7,12 @@ import numpy as np
 import torch
 
 from distrace.camera import Camera
+from distrace.data.solid import Solid
 from distrace.data.view import pictured
-from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, true_solid
+from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, surface_of, true_solid
 from distrace.evaluation.trials import grouped
 from distrace.pages.charts import steps_chart
 from distrace.pages.page import Html, figure, page, paragraph, section, table
-from distrace.pages.report import View
-from distrace.render import render
 from distrace.shading import Picture, grid
 
 PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than ours (Liu et al., CVPR 2020, table 3)
@@ -28,6 +27,7 @@ PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than
     ("table", "DIST + mask"): (5.37, 5.15, 5.16, 5.26, 6.33, 7.62),
 }
 PICTURE = 176  # pixels
+_BLANK = np.full((PICTURE, PICTURE, 3), 255, np.uint8)
 AXES = {"sparse-depth": "density", "noise": "noise", "focal": "focal_ratio"}
 LABELS = {"density": "depths", "noise": "noise on the depths", "focal_ratio": "focal length, to 60 mm"}
 
@@ -153,14 +153,12 @@ def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Pl
         if (each.trial.shape, each.trial.view, _condition(each)) == (one.trial.shape, one.trial.view, _condition(one))
     }
     truth = pictured(true_solid(place.meshes, one.trial.category, one.trial.shape), camera)
-    blank = np.full((PICTURE, PICTURE, 3), 255, np.uint8)
-    return [truth, *(_shaded(made[method], camera, place) if method in made else blank for method in methods)]
+    return [truth, *(_shaded(made[method], camera, place) if method in made else _BLANK for method in methods)]
 
 
 def _shaded(each: Done, camera: Camera, place: Place) -> Picture:
-    model = place.model_of(each.trial.category)
-    with torch.no_grad():
-        return View.of(render(model.field(torch.tensor(each.code)), camera)).shaded
+    surface = surface_of(place, each.trial, torch.tensor(each.code))
+    return _BLANK if surface is None else pictured(Solid(surface, surface), camera)
 
 
 def _two(value: object) -> str:

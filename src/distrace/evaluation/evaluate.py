@@ -16,8 +16,9 @@ from distrace.data.split import Shape
 from distrace.data.view import observe, pictured
 from distrace.evaluation.bench import poster_view
 from distrace.fitting.code_residuals import Comparison
+from distrace.fitting.consistent import completed
 from distrace.fitting.fit_code import CodeFitConfig, fit_points
-from distrace.fitting.methods import METHODS, steps_of
+from distrace.fitting.methods import METHODS, steps_of, told
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
@@ -61,8 +62,8 @@ def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution
     """Each training shape as its code gives it, against the outer surface of its mesh."""
     for shape in shapes:
         if shape.name in model.shapes:
-            truth, code = solid_of(shape, meshes).surface, model.code_of(shape.name)
-            yield compared(shape.name, "training code", 0, model, code, truth, 0.0, resolution)
+            mesh = extract_mesh(model.field(model.code_of(shape.name)), MeshConfig(resolution))
+            yield compared(shape.name, "training code", 0, mesh, solid_of(shape, meshes).surface, 0.0)
 
 
 def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
@@ -76,7 +77,8 @@ def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
     samples = torch.from_numpy(sample(solid, TOLD, seed=0, near=TOLD_NEAR))
     steps = list(fit_points(model.decoder, samples, prior_of(model.codes), TOLD_FIT))
     seconds = sum(step.seconds for step in steps)
-    return compared(name, "all distances", 0, model, steps[-1].code, solid.surface, seconds, resolution)
+    mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution))
+    return compared(name, "all distances", 0, mesh, solid.surface, seconds)
 
 
 def completion_results(
@@ -87,22 +89,15 @@ def completion_results(
         solid = solid_of(shape, meshes)
         view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
         for method in METHODS:
-            steps = list(steps_of(model, view, method, config))
-            seconds = sum(step.seconds for step in steps)
-            yield compared(shape.name, method, points, model, steps[-1].code, solid.surface, seconds, resolution)
+            seen = told(view, method)
+            steps = list(steps_of(model, seen, method, config))
+            mesh = completed(model.field(steps[-1].code), seen, MeshConfig(resolution))
+            yield compared(shape.name, method, points, mesh, solid.surface, sum(step.seconds for step in steps))
 
 
 def compared(
-    shape: str,
-    method: str,
-    points: int,
-    model: Model,
-    code: torch.Tensor,
-    truth: trimesh.Trimesh,
-    seconds: float,
-    resolution: int,
+    shape: str, method: str, points: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh, seconds: float
 ) -> Result:
-    mesh = extract_mesh(model.field(code), MeshConfig(resolution))
     distance = chamfer(mesh, truth)
     return Result(shape, method, points, distance.to, distance.from_, distance.sum, seconds, mesh, truth)
 

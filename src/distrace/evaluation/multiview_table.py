@@ -25,8 +25,8 @@ from distrace.data.pictures import read_mask
 from distrace.data.view import View
 from distrace.errors import explained
 from distrace.evaluation.semi_global import stereo_points
-from distrace.evaluation.sparse_depth import fingerprint, hash_of, true_solid
-from distrace.evaluation.trials import grouped, opened_once, read_json
+from distrace.evaluation.sparse_depth import true_solid
+from distrace.evaluation.trials import fingerprint, grouped, hash_of, opened_once, read_json
 from distrace.files import save_json, written
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh

@@ -3,7 +3,6 @@
 The same trials, with noise on the depths or at other focal lengths, make its two neighbours.
 """
 
-import hashlib
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -11,6 +10,9 @@ from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checkpoint import Model
@@ -18,11 +20,12 @@ from distrace.data.noise import NOISES, noisy
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape, on_side, shape_of
 from distrace.data.view import View, observe
-from distrace.evaluation.trials import opened_once, read_json
+from distrace.evaluation.trials import fingerprint, hash_of, opened_once, read_json
 from distrace.files import save_json
+from distrace.fitting.consistent import completed
 from distrace.fitting.fit_code import CodeFitConfig
-from distrace.fitting.methods import settings_of, steps_of
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.fitting.methods import settings_of, steps_of, told
+from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
@@ -59,6 +62,9 @@ class Place:
     out: Path
     models: tuple[tuple[str, str], ...]  # of each category
     resolution: int = 192  # of the meshes that are compared
+
+    def __post_init__(self) -> None:
+        MeshConfig(self.resolution)  # before any fit, raises for what no mesh has
 
     def model_of(self, category: str) -> Model:
         return opened_once(dict(self.models)[category])
@@ -149,19 +155,16 @@ def observed(trial: Trial, meshes: Path) -> View:
 def done(place: Place, trial: Trial) -> Done:
     """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
     path, model, config = place.out / "trials" / trial.file, place.model_of(trial.category), CodeFitConfig()
-    mark = fingerprint(model, place.resolution, settings_of(trial.method, config))
+    mark = fingerprint(model, place.resolution, *settings_of(trial.method, config))
     if path.is_file():
         kept = read_json(path)
         if kept.pop("made_by", None) == mark:
             return Done(Trial(**kept.pop("trial")), **kept)
-    resolved = MeshConfig(place.resolution)
-    steps = list(steps_of(model, observed(trial, place.meshes), trial.method, config))
+    steps = list(steps_of(model, told(observed(trial, place.meshes), trial.method), trial.method, config))
     code = steps[-1].code
-    try:
-        found = extract_mesh(model.field(code), resolved)
-    except ValueError:  # it has no surface
-        found = _nothing()
-    distance = chamfer(found, true_solid(place.meshes, trial.category, trial.shape).surface)
+    found = surface_of(place, trial, code)
+    truth = true_solid(place.meshes, trial.category, trial.shape).surface
+    distance = chamfer(_nothing() if found is None else found, truth)
     result = Done(
         trial,
         distance.to,
@@ -174,6 +177,15 @@ def done(place: Place, trial: Trial) -> Done:
     return result
 
 
+def surface_of(place: Place, trial: Trial, code: Float[Tensor, "length"]) -> trimesh.Trimesh | None:
+    """What a trial's code is a completion of; none where it has no surface."""
+    seen, config = told(observed(trial, place.meshes), trial.method), MeshConfig(place.resolution)
+    try:
+        return completed(place.model_of(trial.category).field(code), seen, config)
+    except ValueError:
+        return None
+
+
 def _nothing() -> np.ndarray:
     """What an empty surface is compared as: one point in the middle."""
     return np.zeros((1, 3))
@@ -183,16 +195,3 @@ def _nothing() -> np.ndarray:
 def true_solid(meshes: Path, category: str, name: str) -> Solid:
     """A shape of a split; looked for once."""
     return solid_of(shape_of(category, name), meshes)
-
-
-@lru_cache
-def fingerprint(model: Model, *settings: object) -> str:
-    """Tells models and settings apart: a change of a weight, or of a default, changes it."""
-    digest = hashlib.sha256(repr(settings).encode())
-    for tensor in (*model.decoder.state_dict().values(), model.codes):
-        digest.update(tensor.cpu().numpy().tobytes())
-    return digest.hexdigest()[:16]
-
-
-def hash_of(name: str) -> int:
-    return int(hashlib.sha256(name.encode()).hexdigest()[:6], 16)

@@ -11,12 +11,13 @@ from scipy.stats import rankdata
 
 from distrace.data.split import Shape
 from distrace.data.view import observe
-from distrace.evaluation.sparse_depth import camera_of, hash_of, true_solid
-from distrace.evaluation.trials import opened_once
+from distrace.evaluation.sparse_depth import camera_of, true_solid
+from distrace.evaluation.trials import hash_of, opened_once
+from distrace.fitting.consistent import completed
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.plausible import plausible, spread
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
 from distrace.processes import each_done
 
@@ -48,7 +49,7 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
     steps = list(completing(opened, view, CodeFitConfig()))
     others = list(plausible(opened, view, COMPLETIONS, seed=seed))
-    mesh = extract_mesh(opened.field(steps[-1].code), MeshConfig())
+    mesh = completed(opened.field(steps[-1].code), view, MeshConfig())
     points = surface_points(mesh, LOOKED_AT, seed=0)
     apart = spread(opened, [step.code for step in others], torch.tensor(points, dtype=torch.float32)).numpy()
     error, calm = truth.apart(points), apart < np.median(apart)

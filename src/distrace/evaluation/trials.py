@@ -1,8 +1,9 @@
 """Experiments of many trials that do not depend on each other: they go on where they were stopped."""
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable
-from functools import cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -30,3 +31,16 @@ def read_json(path: Path) -> Any:
     """What a trial left. Raises `ValueError` for a file that is not JSON."""
     with explained(f"{path} holds no trials; remove it to begin anew"):
         return json.loads(path.read_text())
+
+
+@lru_cache
+def fingerprint(model: Model, *settings: object) -> str:
+    """Tells models and settings apart: a change of a weight, or of a default, changes it."""
+    digest = hashlib.sha256(repr(settings).encode())
+    for tensor in (*model.decoder.state_dict().values(), model.codes):
+        digest.update(tensor.cpu().numpy().tobytes())
+    return digest.hexdigest()[:16]
+
+
+def hash_of(name: str) -> int:
+    return int(hashlib.sha256(name.encode()).hexdigest()[:6], 16)

@@ -1,11 +1,11 @@
 """The ways to complete a shape that are compared: DeepSDF's, and ours from what more and more is known of."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 from distrace.checkpoint import Model
 from distrace.data.cloud import Cloud
 from distrace.data.view import View
+from distrace.fitting.consistent import MARGIN
 from distrace.fitting.fit import FitConfig, fit_shape
 from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples, on_surface
@@ -17,26 +17,32 @@ CLOUDS = ("points", "points+normals")  # ours, not knowing the camera
 DEEPSDF = SampleFitConfig(samples=500)  # where the original has 8,000 in an iteration: docs/from_the_paper.md
 
 
-def steps_of(model: Model, view: View, method: str, config: FitConfig | CodeFitConfig) -> Iterator[Step]:
-    """A view completed by a method; the last step is the result. The view has normals where the method takes them.
+def told(view: View, method: str) -> View | Cloud:
+    """What a method is told of a view, which has normals where the method takes them.
 
     Raises `ValueError` for another method.
     """
     if method not in METHODS + CLOUDS:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS + CLOUDS)}")
-    view = view.to(model.codes.device)
+    if method in ("ours", "ours+mask"):
+        return view.without("normal") if method == "ours+mask" else view.without("normal", "mask")
     cloud = Cloud(view.points(), None if view.normal is None else view.normal[view.seen])
-    if method == "deepsdf":
-        assert cloud.normals is not None, "DeepSDF is given the true normals"
-        return fit_samples(model.decoder, around_points(cloud.points, cloud.normals), DEEPSDF)
-    if method in CLOUDS:
-        return completing(model, cloud if method == "points+normals" else cloud.without("normal"), config)
-    return completing(model, replace(view, normal=None, mask=view.mask if method == "ours+mask" else None), config)
+    return cloud.without("normal") if method == "points" else cloud
 
 
-def settings_of(method: str, config: FitConfig | CodeFitConfig) -> FitConfig | CodeFitConfig | SampleFitConfig:
+def steps_of(model: Model, seen: View | Cloud, method: str, config: FitConfig | CodeFitConfig) -> Iterator[Step]:
+    """What a method is told, completed by it; the last step is the result."""
+    if method != "deepsdf":
+        return completing(model, seen, config)
+    cloud = seen.to(model.codes.device)
+    assert isinstance(cloud, Cloud)
+    assert cloud.normals is not None, "DeepSDF is given the true normals"
+    return fit_samples(model.decoder, around_points(cloud.points, cloud.normals), DEEPSDF)
+
+
+def settings_of(method: str, config: FitConfig | CodeFitConfig) -> tuple[object, ...]:
     """What a method follows."""
-    return DEEPSDF if method == "deepsdf" else config
+    return (DEEPSDF,) if method == "deepsdf" else (config, MARGIN)
 
 
 def completing(
