@@ -16,7 +16,7 @@ from distrace.data.cloud import Cloud
 from distrace.data.view import View
 from distrace.evaluation.bench import poster_view
 from distrace.files import written
-from distrace.fitting.consistent import completed
+from distrace.fitting.consistent import LEFT_OUT, completed
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
@@ -140,6 +140,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
     facts = {
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
+        "pieces left out of the mesh, where the view shows nothing": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
         "iterations": str(task.fit),
         "evaluations of the network": f"{outcome.evaluations:,}",
         "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",

@@ -13,6 +13,7 @@ from distrace.field import SDF
 from distrace.mesh import MeshConfig, extract_mesh
 
 MARGIN = 0.03  # of the unit sphere's radius: what is nearer to what was seen does not contradict it
+LEFT_OUT = "left_out"
 
 
 def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> trimesh.Trimesh:
@@ -27,7 +28,7 @@ def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> trimesh.Trime
 def consistent(mesh: trimesh.Trimesh, view: View) -> trimesh.Trimesh:
     """The mesh without pieces, connected to nothing else, most of whose area lies where the view shows free space.
 
-    The largest piece stays in any case.
+    The largest piece stays in any case. How many are gone is in the metadata, by the name `left_out`.
     """
     pieces = connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     whole = np.bincount(pieces, weights=mesh.area_faces)
@@ -39,6 +40,7 @@ def consistent(mesh: trimesh.Trimesh, view: View) -> trimesh.Trimesh:
     found = mesh.copy()
     found.update_faces(kept[pieces])
     found.remove_unreferenced_vertices()
+    found.metadata[LEFT_OUT] = int((~kept).sum())
     return found
 
 
