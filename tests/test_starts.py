@@ -54,6 +54,15 @@ def test_a_judge_may_see_the_ends_differently() -> None:
     assert (last.start, last.loss, last.seconds, last.evaluations) == (1, 1.0, 1.0, 6)
 
 
+@pytest.mark.parametrize(("doubtful", "tried", "best"), [(2.0, 2, 1), (1.0, 3, 2), (0.5, 4, 2)])
+def test_more_are_tried_while_no_end_is_good_enough(doubtful: float, tried: int, best: int) -> None:
+    starts = Starts(iterations=2, starts=2, trial=1, kept=2, more=2, doubtful=doubtful)
+    steps = run([[4, 3], [4, 2], [4, 1], [4, 3]], starts, by_last_loss)
+    assert {step[0] for step in steps} == set(range(tried))
+    assert steps[-1] == (best, 2, 0.0)
+    assert len(steps) == 2 * tried + 1 <= starts.total == 9
+
+
 def test_a_start_that_has_settled_gives_its_last_step_again_which_costs_nothing() -> None:
     assert run([[2, 1], [9, 8]], Starts(iterations=9, starts=2, trial=2))[-1] == (0, 2, 0.0)
 
@@ -71,6 +80,7 @@ def test_a_single_start_is_not_tried() -> None:
         (Starts(iterations=9, starts=3, trial=2), "9 of 1 start, after 2 of each of 3"),
         (Starts(iterations=9, starts=3, trial=2, kept=2), "9 of 2 starts, after 2 of each of 3"),
         (Starts(iterations=9, starts=3, trial=2, kept=5), "9 of 3 starts"),
+        (Starts(iterations=9, starts=3, trial=2, kept=3, more=2), "9 of 3 starts, of up to 2 more while none fits"),
         (Starts(iterations=1, starts=3, kept=3), "1 of 1 start, after 0 of each of 3"),
     ],
 )

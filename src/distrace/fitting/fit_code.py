@@ -1,7 +1,7 @@
 """Fitting a shape's code by Levenberg–Marquardt, to views or to points: a tenth of Adam's steps, hardly dearer ones."""
 
 import time
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from math import isfinite
@@ -20,7 +20,7 @@ from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
-from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, stages_of
+from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, passed, stages_of
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.losses import Weights
@@ -40,6 +40,8 @@ class CodeFitConfig(Starts):
 
     iterations: int = 16
     kept: int = 3  # all of three starts: what a few iterations reach says little about the end
+    more: int = 5
+    doubtful: float = 0.025  # depths off by that, in radii of the unit sphere, or a quarter of the silhouette
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates
@@ -106,7 +108,7 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
 
     From farther away such rays, which pull from both sides, lead to other ends more often than they help.
     """
-    best = yield from _passed(steps)
+    best = yield from passed(steps)
     step, problem.scale, w = best, config.outlying, problem.prior.coordinates(best.code)
     solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
     for step, _ in _stage(problem, w, None, solver, best.start, best.iteration):
@@ -114,15 +116,6 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
     before, after = (_judged(problem.decoder, verdict, end) for end in (best, step))
     seconds, evaluations = before.seconds + after.seconds, before.evaluations + after.evaluations
     yield replace(min(before, after, key=lambda end: end.verdict), seconds=seconds, evaluations=evaluations)
-
-
-def _passed(steps: Iterator[Step]) -> Generator[Step, None, Step]:
-    """All of them; the last one is returned, too."""
-    step = next(steps)
-    yield step
-    for step in steps:
-        yield step
-    return step
 
 
 def fit_points(
@@ -149,7 +142,7 @@ def fit_points(
     near = samples[samples[:, 3].abs() < FAR]
     some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
     others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, config, verdict)
+    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0), verdict)
 
 
 def _best(
@@ -161,7 +154,7 @@ def _best(
     verdict: Verdict,
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best."""
-    first = first_of(decoder, prior, hints, config.starts, config.seed)
+    first = first_of(decoder, prior, hints, config.most, config.seed)
 
     def run(start: int) -> Iterator[Step]:
         return _solved(problem_of, prior, config, start, first.coordinates[start])

@@ -1,6 +1,6 @@
 """Fitting from several starts, because a loss has many valleys: all are tried, the best go on to their ends."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from math import inf
@@ -21,6 +21,8 @@ class Starts:
     starts: int = 3
     trial: int = 20
     kept: int = 1  # starts that go on after the choice
+    more: int = 0  # other starts, where several go on, one after the other …
+    doubtful: float = 0.0  # … while the best end's verdict is above that
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -39,13 +41,20 @@ class Starts:
         return min(self.kept, self.starts) if self.tried else 1
 
     @property
+    def most(self) -> int:
+        """Starts, at most."""
+        return self.starts + (self.more if self.going_on > 1 else 0)
+
+    @property
     def total(self) -> int:
-        """Steps; where several starts go on, the best one's last is given again."""
-        return self.tried * self.starts + (self.iterations - self.tried) * self.going_on + (self.going_on > 1)
+        """Steps, at most; where several starts go on, the best one's last is given again."""
+        tried, ends = self.tried * self.starts, (self.iterations - self.tried) * self.going_on
+        return tried + ends + (self.most - self.starts) * self.iterations + (self.going_on > 1)
 
     def __str__(self) -> str:
         tried = f", after {self.tried} of each of {self.starts}" if self.going_on < self.starts else ""
-        return f"{self.iterations} of {self.going_on} {'start' if self.going_on == 1 else 'starts'}{tried}"
+        more = f", of up to {self.most - self.starts} more while none fits" if self.most > self.starts else ""
+        return f"{self.iterations} of {self.going_on} {'start' if self.going_on == 1 else 'starts'}{tried}{more}"
 
 
 @dataclass(frozen=True)
@@ -102,7 +111,8 @@ def best_of(
 ) -> Iterator[Stepped]:
     """The steps of all trials, then those of the starts whose verdicts are the least; the last step is the result.
 
-    Of several that go on the judge tells which is best: that one's step is given again, with what judging took.
+    Of several that go on the judge tells which is best, and whether more are tried: the best one's step is given again,
+    with what judging took.
     """
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
@@ -126,8 +136,24 @@ def best_of(
         for ends[k] in runs[start]:
             yield ends[k]
     verdicts = [judge(end) for end in ends]
-    best = min(verdicts, key=lambda end: end.verdict)
-    yield _charged(replace(best, seconds=0.0, evaluations=0), [*compared, *verdicts])
+    for start in range(starts.starts, starts.most):
+        if _best(verdicts).verdict <= starts.doubtful:
+            break
+        verdicts.append(judge((yield from passed(run(start)))))
+    yield _charged(replace(_best(verdicts), seconds=0.0, evaluations=0), [*compared, *verdicts])
+
+
+def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
+    """All of them; the last one is returned, too."""
+    step = next(steps)
+    yield step
+    for step in steps:
+        yield step
+    return step
+
+
+def _best(judged: Sequence[Stepped]) -> Stepped:
+    return min(judged, key=lambda step: step.verdict)
 
 
 def _charged(step: Stepped, judged: Sequence[Stepped]) -> Stepped:
