@@ -8,6 +8,7 @@ import pytest
 import torch
 from bumpy import bumpy_balls
 
+from distrace import rounded
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
@@ -42,6 +43,12 @@ def view(decoder: Decoder) -> View:
     buffers = render(decoder.field(TRUE), CAMERA)
     assert 200 < buffers.mask.sum() < 1400, "it is neither small nor all that there is"
     return View(CAMERA, buffers.depth, buffers.mask)
+
+
+@pytest.fixture
+def exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a processor without products in bfloat16, by which rays that graze are seen otherwise."""
+    monkeypatch.setattr(rounded, "_multiplies_in_bfloat16", lambda: False)
 
 
 def last(steps: Iterator[Step]) -> Step:
@@ -118,6 +125,7 @@ def test_the_shape_of_another_code_is_found_in_a_few_steps(decoder: Decoder, vie
     assert all(step.evaluations > 0 and step.seconds > 0 for step in steps)
 
 
+@pytest.mark.usefixtures("exact_products")
 def test_continuing_from_the_last_hits_finds_what_a_whole_march_finds(decoder: Decoder, view: View) -> None:
     problem = problem_of(decoder, view, CONFIG.compared)
     w = torch.tensor([0.5, -0.2, 0.3, 0.1])
@@ -126,17 +134,17 @@ def test_continuing_from_the_last_hits_finds_what_a_whole_march_finds(decoder: D
     continued = problem.moved(start, w)
     between = problem.evaluations
     anew = problem.look(w)
-    assert (continued.hit == anew.hit).float().mean() > 0.98, "but for rays that graze, where products are in bfloat16"
+    assert (continued.hit == anew.hit).float().mean() > 0.99
     both = continued.hit & anew.hit & continued.compared & anew.compared
     known = both & problem.seen.known
     torch.testing.assert_close(continued.distance[known], anew.distance[known], atol=1e-2, rtol=0)
     (one, other), along = (look.distance[both & ~known] for look in (continued, anew)), problem.seen.rays[both & ~known]
     sdf = decoder.field(PRIOR.code(w))
-    short = sdf(along.at(one)) - sdf(along.at(other))  # twice what it is where products are not in bfloat16
-    assert (short < 6e-3).all(), "what is least on a ray is no less than it is anew"
+    assert (sdf(along.at(one)) < sdf(along.at(other)) + 3e-3).all(), "what is least on a ray is no less than it is anew"
     assert between - before < problem.evaluations - between, "at fewer evaluations"
 
 
+@pytest.mark.usefixtures("exact_products")
 def test_rays_are_looked_along_again_where_the_scale_is_another(decoder: Decoder, view: View) -> None:
     problem = problem_of(decoder, view, CONFIG.compared)
     first = problem.look(torch.zeros(4))
@@ -147,7 +155,7 @@ def test_rays_are_looked_along_again_where_the_scale_is_another(decoder: Decoder
     assert problem.evaluations == before
     problem.scale /= 2
     again, anew = problem.look(moved.w, moved), problem.look(moved.w)
-    assert (again.hit == anew.hit).float().mean() > 0.98
+    assert (again.hit == anew.hit).float().mean() > 0.99
     assert before < problem.evaluations < before + 2 * asked
 
 

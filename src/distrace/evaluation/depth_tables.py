@@ -9,8 +9,9 @@ import torch
 from distrace.camera import Camera
 from distrace.data.solid import Solid
 from distrace.data.view import pictured
-from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, surface_of, true_solid
+from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, observed, surface_of, true_solid
 from distrace.evaluation.trials import grouped
+from distrace.fitting.methods import told
 from distrace.pages.charts import steps_chart
 from distrace.pages.page import Html, figure, page, paragraph, section, table
 from distrace.shading import Picture, grid
@@ -157,7 +158,8 @@ def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Pl
 
 
 def _shaded(each: Done, camera: Camera, place: Place) -> Picture:
-    surface = surface_of(place, each.trial, torch.tensor(each.code))
+    seen = told(observed(each.trial, place.meshes), each.trial.method)
+    surface = surface_of(place, each.trial, seen, torch.tensor(each.code))
     return _BLANK if surface is None else pictured(Solid(surface, surface), camera)
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checkpoint import Model
+from distrace.data.cloud import Cloud
 from distrace.data.noise import NOISES, noisy
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape, on_side, shape_of
@@ -160,9 +161,10 @@ def done(place: Place, trial: Trial) -> Done:
         kept = read_json(path)
         if kept.pop("made_by", None) == mark:
             return Done(Trial(**kept.pop("trial")), **kept)
-    steps = list(steps_of(model, told(observed(trial, place.meshes), trial.method), trial.method, config))
+    seen = told(observed(trial, place.meshes), trial.method)
+    steps = list(steps_of(model, seen, trial.method, config))
     code = steps[-1].code
-    found = surface_of(place, trial, code)
+    found = surface_of(place, trial, seen, code)
     truth = true_solid(place.meshes, trial.category, trial.shape).surface
     distance = chamfer(_nothing() if found is None else found, truth)
     result = Done(
@@ -177,11 +179,10 @@ def done(place: Place, trial: Trial) -> Done:
     return result
 
 
-def surface_of(place: Place, trial: Trial, code: Float[Tensor, "length"]) -> trimesh.Trimesh | None:
-    """What a trial's code is a completion of; none where it has no surface."""
-    seen, config = told(observed(trial, place.meshes), trial.method), MeshConfig(place.resolution)
+def surface_of(place: Place, trial: Trial, seen: View | Cloud, code: Float[Tensor, "length"]) -> trimesh.Trimesh | None:
+    """What a trial's code makes of what was seen; none where it has no surface."""
     try:
-        return completed(place.model_of(trial.category).field(code), seen, config)
+        return completed(place.model_of(trial.category).field(code), seen, MeshConfig(place.resolution))
     except ValueError:
         return None
 
