@@ -3,21 +3,24 @@
 import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
 import trimesh
+from pretended import DEVICE, pretended
 
 from distrace.checkpoint import Model, save_model
 from distrace.decoder import Decoder, NetworkSpecs
+from distrace.evaluation import focal_test, sparse_depth
 from distrace.evaluation.depth_tables import AXES, depth_page, ratios, rows_of, wide
+from distrace.evaluation.focal_test import looks
 from distrace.evaluation.sparse_depth import (
     AZIMUTHS_ELEVATIONS,
     CONDITIONS,
     DENSITIES,
     RATIOS,
     Done,
-    Place,
     Trial,
     all_trials,
     camera_of,
@@ -26,6 +29,8 @@ from distrace.evaluation.sparse_depth import (
     observed,
     true_solid,
 )
+from distrace.evaluation.trials import Place
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.rays import meet_sphere
@@ -101,6 +106,20 @@ def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
     again = done(place, wanted)
     assert again.seconds > 0
     assert again.chamfer == pytest.approx(first.chamfer, rel=1e-6)
+
+
+def test_shapes_are_completed_and_looked_at_on_the_device(
+    place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    short = CodeFitConfig(iterations=4, starts=1, more=0)
+    monkeypatch.setattr(focal_test, "RATIOS", (1.0,))
+    monkeypatch.setattr(sparse_depth, "CodeFitConfig", lambda: short)
+    wanted, here = trial(place, density="20"), replace(place, out=tmp_path / "here")
+    there = replace(here, out=tmp_path / "there", device=DEVICE)
+    with pretended(monkeypatch):
+        assert done(there, wanted).chamfer == pytest.approx(done(here, wanted).chamfer, rel=0.05)
+        overlaps = [[look.iou for look in looks(where, wanted)] for where in (there, here)]
+    assert overlaps[0] == pytest.approx(overlaps[1], abs=0.03)
 
 
 @pytest.mark.parametrize("method", ["deepsdf", "ours", "points", "points+normals"])

@@ -20,13 +20,13 @@ from distrace.evaluation.sparse_depth import (
     AZIMUTHS_ELEVATIONS,
     CONDITIONS,
     Done,
-    Place,
     Trial,
     all_trials,
     done,
     held_out,
 )
 from distrace.evaluation.spread_table import spread_rows
+from distrace.evaluation.trials import Place
 from distrace.files import save_text
 from distrace.fitting.methods import METHODS
 from distrace.processes import each_done
@@ -43,12 +43,13 @@ class _DepthTable:
     out: Path = Path("out/evaluate")
     resolution: int = 192  # of the meshes that are compared
     jobs: int = 2  # processes
+    device: str = "cpu"
 
     def _run(self, name: str, more: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
         """Each trial leaves a file in `trials`; what is there already is not done again. `more` facts may follow."""
         checked(self.jobs, self.shapes, self.views)
-        run, models = start(self.out), paired(self.classes, self.models)
-        place = Place(self.meshes, run.out, models, self.resolution)
+        run, models = start(self.out, self.device), paired(self.classes, self.models)
+        place = Place(self.meshes, run.out, models, self.resolution, run.device)
         trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
         results: list[Done] = []
         with progress(name, len(trials)) as bar:

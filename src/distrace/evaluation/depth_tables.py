@@ -9,8 +9,8 @@ import torch
 from distrace.camera import Camera
 from distrace.data.solid import Solid
 from distrace.data.view import pictured
-from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, Place, camera_of, observed, surface_of, true_solid
-from distrace.evaluation.trials import grouped
+from distrace.evaluation.sparse_depth import DENSITIES, SIZE, Done, camera_of, observed, surface_of, true_solid
+from distrace.evaluation.trials import Place, grouped
 from distrace.fitting.methods import told
 from distrace.pages.charts import steps_chart
 from distrace.pages.page import Html, figure, page, paragraph, section, table

@@ -7,8 +7,8 @@ from statistics import median
 import torch
 
 from distrace.data.view import observe
-from distrace.evaluation.sparse_depth import RATIOS, Place, Trial, camera_of, done, true_solid
-from distrace.evaluation.trials import grouped
+from distrace.evaluation.sparse_depth import RATIOS, Trial, camera_of, done, true_solid
+from distrace.evaluation.trials import Place, grouped
 from distrace.metrics import depth_errors, iou
 from distrace.render import render
 
@@ -29,14 +29,14 @@ class Look:
 @torch.no_grad()
 def looks(place: Place, trial: Trial) -> list[Look]:
     """At every focal length, from the direction of the observation."""
-    field = place.model_of(trial.category).field(torch.tensor(done(place, trial).code))
+    field = place.field_of(trial.category, torch.tensor(done(place, trial).code))
     truth, found = true_solid(place.meshes, trial.category, trial.shape), []
     for ratio in RATIOS:
         camera = camera_of(trial.view, ratio).resized(COARSER)
-        buffers, seen = render(field, camera), observe(truth, camera)
-        errors = depth_errors(buffers.depth, seen.depth)
+        buffers, seen = render(field, camera.to(place.device)), observe(truth, camera)
+        errors = depth_errors(buffers.depth.cpu(), seen.depth)
         error = errors.median().item() if len(errors) else float("inf")
-        found.append(Look(trial.category, trial.method, ratio, error, iou(buffers.mask, seen.seen)))
+        found.append(Look(trial.category, trial.method, ratio, error, iou(buffers.mask.cpu(), seen.seen)))
     return found
 
 

@@ -15,18 +15,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checkpoint import Model
 from distrace.data.cloud import Cloud
 from distrace.data.noise import NOISES, noisy
 from distrace.data.solid import Solid, solid_of
 from distrace.data.split import Shape, on_side, shape_of
 from distrace.data.view import View, observe
-from distrace.evaluation.trials import fingerprint, hash_of, opened_once, read_json
+from distrace.evaluation.trials import Place, fingerprint, hash_of, read_json
 from distrace.files import save_json
 from distrace.fitting.consistent import completed
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import settings_of, steps_of, told
-from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
@@ -53,22 +51,6 @@ class Trial:
     def file(self) -> str:
         parts = (self.shape, self.view, self.density, self.noise, f"{self.focal_ratio:g}", self.method)
         return f"{Path(self.category).stem}/{'_'.join(map(str, parts))}.json"
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where meshes, models and results lie."""
-
-    meshes: Path  # a folder for each source, as `distrace data` makes them
-    out: Path
-    models: tuple[tuple[str, str], ...]  # of each category
-    resolution: int = 192  # of the meshes that are compared
-
-    def __post_init__(self) -> None:
-        MeshConfig(self.resolution)  # before any fit, raises for what no mesh has
-
-    def model_of(self, category: str) -> Model:
-        return opened_once(dict(self.models)[category])
 
 
 @dataclass(frozen=True)
@@ -182,7 +164,7 @@ def done(place: Place, trial: Trial) -> Done:
 def surface_of(place: Place, trial: Trial, seen: View | Cloud, code: Float[Tensor, "length"]) -> trimesh.Trimesh | None:
     """What a trial's code makes of what was seen; none where it has no surface."""
     try:
-        return completed(place.model_of(trial.category).field(code), seen, MeshConfig(place.resolution))
+        return completed(place.field_of(trial.category, code), seen, place.mesh)
     except ValueError:
         return None
 

@@ -3,14 +3,46 @@
 import hashlib
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from distrace.checkpoint import Model, load_model
 from distrace.errors import explained
+from distrace.field import SDF
+from distrace.mesh import MeshConfig
 
 Result = TypeVar("Result")
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where meshes, models and results lie."""
+
+    meshes: Path  # a folder for each source, as `distrace data` makes them
+    out: Path
+    models: tuple[tuple[str, str], ...]  # of each category
+    resolution: int = 192  # of the meshes that are compared
+    device: torch.device = torch.device("cpu")  # where shapes are completed
+
+    def __post_init__(self) -> None:
+        _ = self.mesh  # before any fit, raises for what no mesh has
+
+    @property
+    def mesh(self) -> MeshConfig:
+        return MeshConfig(self.resolution, device=self.device)
+
+    def model_of(self, category: str) -> Model:
+        return opened_once(dict(self.models)[category], self.device)
+
+    def field_of(self, category: str, code: Float[Tensor, "length"]) -> SDF:
+        """On the device, wherever the code is."""
+        return self.model_of(category).field(code.to(self.device))
 
 
 def grouped(results: Iterable[Result], key: Callable[[Result], tuple]) -> dict[tuple, list[Result]]:
@@ -22,9 +54,9 @@ def grouped(results: Iterable[Result], key: Callable[[Result], tuple]) -> dict[t
 
 
 @cache
-def opened_once(name: str) -> Model:
+def opened_once(name: str, device: torch.device = torch.device("cpu")) -> Model:
     """A model, read once by each process."""
-    return load_model(name)
+    return load_model(name).to(device)
 
 
 def read_json(path: Path) -> Any:
