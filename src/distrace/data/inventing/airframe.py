@@ -17,12 +17,16 @@ def both_sides(parts: list[Part]) -> list[Part]:
 
 
 def fuselage(random: np.random.Generator, wide: float, nose: float, rear: float, thick_end: float = 0.0) -> list[Part]:
-    """Round or flattened; `nose` and `rear` are how long its ends are, which lift towards the tail."""
-    tall, blunt, lift = wide * random.uniform(0.9, 1.3), random.uniform(0.5, 1.0), random.uniform(0.2, 0.8)
-    last = max(thick_end, random.uniform(0.06, 0.25))
+    """Round, flattened or boxy; `nose` and `rear` are how long its ends are, which lift towards the tail."""
+    tall, blunt, lift = wide * random.uniform(0.9, 1.3), random.uniform(0.25, 1.0), random.uniform(0.2, 0.8)
+    last, slender = max(thick_end, random.uniform(0.06, 0.25)), random.uniform(0.8, 1.8)
+    boxy = random.choice([2.0, random.uniform(2.0, 5.0)])
     fore = [(0.5 - nose * t, (1 - (1 - t) ** 2) ** blunt, -0.25 * (1 - t) ** 2) for t in np.linspace(0.01, 1, 8)]
-    aft = [(rear * (1 - t) - 0.5, 1 - (1 - last) * t**1.5, lift * (1 - last) * t**1.5) for t in np.linspace(0, 1, 7)]
-    rings = [ring((0, rise * tall, z), wide * share, tall * share) for z, share, rise in fore + aft]
+    aft = [
+        (rear * (1 - t) - 0.5, 1 - (1 - last) * t**slender, lift * (1 - last) * t**slender)
+        for t in np.linspace(0, 1, 7)
+    ]
+    rings = [ring((0, rise * tall, z), wide * share, tall * share, boxy=boxy) for z, share, rise in fore + aft]
     return lofted(rings)
 
 
@@ -47,6 +51,22 @@ def wing(
         return aerofoil(front, chord * share, thick * (1 - 0.3 * out))
 
     return both_sides(lofted([section(*rest) for rest in chords]))
+
+
+def winglets(place: tuple[float, float], half: float, chord: float, sweep: float, dihedral: float) -> list[Part]:
+    """What stands up at the ends of a pair of wings whose root's front edge is at a place, `chord` long at the tips."""
+    (y, z), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
+    return both_sides([fin((half, y + half * up + 0.015, z - half * back), 0.35 * chord + 0.03, 0.8 * chord, 35, 0.2)])
+
+
+def tip_tanks(place: tuple[float, float], half: float, size: float, sweep: float, dihedral: float) -> list[Part]:
+    """Slender ones at the ends of a pair of wings."""
+    (y, z), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
+    x, high, begin = half + 0.5 * size, y + half * up, z - half * back + 2 * size
+    sections = ((0.0, 0.1), (-2.0, 0.9), (-3.5, 1.0), (-5.5, 0.7), (-7.5, 0.1))
+    return both_sides(
+        [np.concatenate([ring((x, high, begin + t * size), r * size, r * size, 12) for t, r in sections])]
+    )
 
 
 def tail(random: np.random.Generator, wide: float, sweep: float, on_top: bool) -> list[Part]:
@@ -111,10 +131,12 @@ def lofted(sections: list[Section]) -> list[Part]:
     return [np.concatenate(pair) for pair in pairwise(sections)]
 
 
-def ring(middle: Vector, wide: float, tall: float, sides: int = 24) -> Section:
-    """An upright ellipse across the nose's direction."""
+def ring(middle: Vector, wide: float, tall: float, sides: int = 24, boxy: float = 2.0) -> Section:
+    """An upright ellipse across the nose's direction; above 2, `boxy` is the exponent of a superellipse (Lamé 1818)."""
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    return np.asarray(middle) + np.stack([wide * np.cos(angles), tall * np.sin(angles), 0 * angles], axis=1)
+    unit = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    across, up = (np.sign(unit) * np.abs(unit) ** (2 / boxy) * (wide, tall)).T
+    return np.asarray(middle) + np.stack([across, up, 0 * up], axis=1)
 
 
 def aerofoil(front: Vector, chord: float, thick: float, across: Vector = (0.0, 1.0, 0.0)) -> Section:

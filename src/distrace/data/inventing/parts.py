@@ -71,13 +71,13 @@ def sheet(grid: Float[np.ndarray, "rows columns 3"], thick: float) -> list[Part]
     return list((corners[:, :, None] + thick / 2 * OCTAHEDRON).reshape(len(corners), -1, 3))
 
 
-def row(count: int, low: Vector, high: Vector, radius: float, axis: int = 0) -> list[Part]:
-    """Blocks side by side."""
+def row(count: int, low: Vector, high: Vector, radius: float, axis: int = 0, gap: float = 0.0) -> list[Part]:
+    """Blocks side by side, so far apart."""
     ends = np.linspace(low[axis], high[axis], count + 1)
     parts = []
     for first, last in pairwise(ends):
         begin, end = np.array(low, np.float64), np.array(high, np.float64)
-        begin[axis], end[axis] = first, last
+        begin[axis], end[axis] = first + gap / 2, last - gap / 2
         parts.append(block(begin, end, radius))
     return parts
 

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from .airframe import both_sides, canopy, fin, fuselage, gear, jet, spinner, tail, wing
+from .airframe import both_sides, canopy, fin, fuselage, gear, jet, spinner, tail, tip_tanks, wing, winglets
 from .parts import Part, block, rod
 
 
 def plane(random: np.random.Generator) -> list[Part]:
-    """An airliner, a propeller aircraft with one to four engines, or a fighter; its gear is out now and then."""
-    kind = random.choice(["airliner", "propeller", "fighter"], p=[0.45, 0.35, 0.2])
-    return {"airliner": airliner, "propeller": propeller, "fighter": fighter}[kind](random)
+    """An airliner, a propeller aircraft with one to four engines, a fighter or a glider; now and then on its wheels."""
+    kinds = (airliner, propeller, fighter, glider)
+    return kinds[random.choice(len(kinds), p=[0.38, 0.38, 0.2, 0.04])](random)
 
 
 def airliner(random: np.random.Generator) -> list[Part]:
@@ -18,8 +18,10 @@ def airliner(random: np.random.Generator) -> list[Part]:
     high, rear = random.random() < 0.15, random.random() < 0.35
     y, sweep = (0.8 if high else -0.6) * wide, random.uniform(22, 36)
     dihedral = random.uniform(-4, 1) if high else random.uniform(3, 8)
-    wings = wing(random, (y, at), span / 2, random.uniform(0.15, 0.22), random.uniform(0.15, 0.35), sweep, dihedral)
-    parts = fuselage(random, wide, random.uniform(0.1, 0.16), random.uniform(0.28, 0.4)) + wings
+    chord, taper = random.uniform(0.15, 0.22), random.uniform(0.15, 0.35)
+    parts = fuselage(random, wide, random.uniform(0.1, 0.16), random.uniform(0.28, 0.4))
+    parts += wing(random, (y, at), span / 2, chord, taper, sweep, dihedral)
+    parts += winglets((y, at), span / 2, taper * chord, sweep, dihedral) if random.random() < 0.25 else []
     parts += tail(random, wide, sweep + random.uniform(0, 12), on_top=high or rear or random.random() < 0.08)
     size = wide * random.uniform(0.35, 0.6)
     if rear:
@@ -61,7 +63,9 @@ def propeller(random: np.random.Generator) -> list[Part]:
     y, dihedral = (0.9 if high else -0.7) * wide, random.uniform(0, 2) if high else random.uniform(2, 7)
     parts = fuselage(random, wide, random.uniform(0.06, 0.16), random.uniform(0.35, 0.6))
     parts += wing(random, (y, at), span / 2, chord, taper, sweep, dihedral)
-    if engines == 1 and random.random() < 0.15:
+    if random.random() < 0.1:
+        parts += tip_tanks((y, at), span / 2, random.uniform(0.012, 0.022), sweep, dihedral)
+    if engines == 1 and random.random() < 0.2:
         above, out = y + random.uniform(0.12, 0.2), 0.3 * span
         parts += wing(random, (above, at + 0.03), span / 2, chord, taper, sweep, dihedral)
         parts += both_sides([rod((out, y, at - 0.05), (out, above, at - 0.02), 0.004, 0.004, 6)])
@@ -110,3 +114,13 @@ def fighter(random: np.random.Generator) -> list[Part]:
     elif random.random() < 0.4:
         parts += wing(random, (0.3 * wide, 0.22), random.uniform(0.12, 0.18), 0.1, 0.2, 45, 0, thick=0.05)
     return parts + gear(random, wide, at - 0.1, 0.3)
+
+
+def glider(random: np.random.Generator) -> list[Part]:
+    """Long slender wings at half height, a thin rear, a canopy far in front and no engine."""
+    wide, at, span = random.uniform(0.035, 0.05), random.uniform(0.1, 0.18), random.uniform(1.5, 2.2)
+    chord, taper, y = random.uniform(0.09, 0.13), random.uniform(0.3, 0.7), random.uniform(0.1, 0.7) * wide
+    parts = fuselage(random, wide, random.uniform(0.15, 0.25), random.uniform(0.55, 0.65))
+    parts += wing(random, (y, at), span / 2, chord, taper, random.uniform(-2, 3), random.uniform(1, 4))
+    parts += tail(random, 0.5 * wide, random.uniform(5, 25), on_top=random.random() < 0.6)
+    return [*parts, canopy(random, 0.9 * wide, random.uniform(0.25, 0.32))]

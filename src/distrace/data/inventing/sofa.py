@@ -16,12 +16,11 @@ def sofa(random: np.random.Generator, wide: float | None = None) -> list[Part]:
     arm = random.choice([0.0, random.uniform(0.04, 0.3)], p=[0.15, 0.85])
     inner, base = wide / 2 - arm, max(seat - cushion, floor + 0.04)
     seats = int(random.integers(1, max(round(wide / 0.5), 1) + 1))
-    soft = random.uniform(0.01, cushion / 2.2)
+    soft, gap = random.uniform(0.01, cushion / 2.2), random.choice([0.0, random.uniform(0.003, 0.02)])
 
     parts = [block((-wide / 2, floor, -deep / 2), (wide / 2, base, deep / 2), random.uniform(0.005, 0.04))]
-    parts += row(
-        seats, (-inner, base - 0.02, -deep / 2 + thick / 2), (inner, seat, deep / 2 + random.uniform(-0.03, 0.03)), soft
-    )
+    begin, end = -deep / 2 + thick / 2, deep / 2 + random.uniform(-0.03, 0.03)
+    parts += row(seats, (-inner, base - 0.02, begin), (inner, seat, end), soft, gap=gap)
     if random.random() < 0.92:
         parts += back(random, inner if random.random() < 0.5 else wide / 2, seats, deep, (base, seat, high), thick)
     if arm:
@@ -60,10 +59,9 @@ def back(
     if style in ("cushions", "both"):
         begin = rear if style == "cushions" else rear + thick * 0.25
         top = high - random.uniform(-0.08, 0.1)
-        number = int(random.choice([seats, max(seats - 1, 1), seats + 1]))
-        parts += row(
-            number, (-half, seat - 0.05, begin), (half, top, begin + thick), thick * random.uniform(0.15, 0.48)
-        )
+        number, soft = int(random.choice([seats, max(seats - 1, 1), seats + 1])), thick * random.uniform(0.15, 0.48)
+        gap = random.choice([0.0, random.uniform(0.003, 0.02)])
+        parts += row(number, (-half, seat - 0.05, begin), (half, top, begin + thick), soft, gap=gap)
         parts.append(block((-half, base, rear), (half, seat, rear + thick), 0.01))
     return [tilted(part - hinge, lean) + hinge for part in parts]
 
