@@ -291,6 +291,19 @@ def test_a_model_stays_what_it_was_between_its_shapes_if_it_is_to(tmp_path: Path
     assert changes[1] < changes[0] / 3
 
 
+def test_a_model_that_is_kept_keeps_the_shapes_that_no_sample_tells(tmp_path: Path, run) -> None:
+    both, one = sample_files(tmp_path / "both", 0.3, 0.5), sample_files(tmp_path / "one", 0.3)
+    run("train", both, "--out", tmp_path / "first", *TINY[2:], "--steps", "3")
+    before = load_model(tmp_path / "first")
+    run("train", one, "--out", tmp_path / "kept", "--begin-with", tmp_path / "first", "--steps", "2", "--keep", "1")
+    run("train", one, "--out", tmp_path / "without", "--begin-with", tmp_path / "first", "--steps", "2")
+    kept, without = load_model(tmp_path / "kept"), load_model(tmp_path / "without")
+    assert without.shapes == before.shapes[:1]
+    assert kept.shapes == before.shapes
+    torch.testing.assert_close(kept.codes[1], before.codes[1])
+    assert not torch.allclose(kept.codes[0], before.codes[0])
+
+
 def test_codes_at_which_a_model_is_kept_are_as_usual_as_its_own() -> None:
     codes = 0.3 * torch.randn(40, 4, generator=torch.Generator().manual_seed(0)) + 1
     kept = Kept.of(Model("some", Spheres(), codes, tuple(map(str, range(40)))), [*map(str, range(40)), "new"])

@@ -187,20 +187,21 @@ def _run(
             loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
             if saving.passed():
-                _save(run, samples, training, config)
-    _save(run, samples, training, config)
+                _save(run, samples, training, config, kept)
+    _save(run, samples, training, config, kept)
     return loss
 
 
-def _save(run: Run, samples: Samples, training: Training, config: TrainConfig) -> None:
+def _save(run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None) -> None:
     """The checkpoint to go on from, the model in DeepSDF's layout, the loss so far, and a look at a few shapes."""
     save_training(run.out, training, config, samples.names)
     save_course(run.out / "losses.png", training.losses, COURSE, "steps", f"mean loss of {COURSE} steps")
-    save_experiment(run.out, training.decoder, training.codes, tuple(samples.names))
+    others = kept.others if kept else {}
+    codes = torch.stack([*training.codes.detach(), *others.values()])
+    model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
+    save_experiment(run.out, model.decoder, model.codes, model.shapes)
     training.decoder.eval()
-    codes = training.codes.detach()
-    model = Model(run.out.name, training.decoder, codes, tuple(samples.names))
     camera = poster_view(128).to(run.device)
-    shown = range(0, len(codes), max(len(codes) // PREVIEWED, 1))
+    shown = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
     with torch.no_grad():
         save_png(run.out / "preview.png", side_by_side([View.of(render(model.field(n), camera)).shaded for n in shown]))

@@ -3,7 +3,7 @@
 *Learning without Forgetting* (Li and Hoiem, ECCV 2016), of a field instead of a classifier.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -24,11 +24,13 @@ class Kept:
     decoder: Decoder
     codes: Float[Tensor, "shapes length"]  # of the shapes to learn, as they were
     prior: Prior
+    others: Mapping[str, Float[Tensor, "length"]]  # codes of what it knew and no sample tells: they stay its shapes
 
     @staticmethod
     def of(model: Model, names: Sequence[str]) -> "Kept":
         """About what the model knows of shapes of these names."""
-        return Kept(model.decoder, model.codes_of(names), prior_of(model.codes))
+        others = {name: code for name, code in zip(model.shapes, model.codes, strict=True) if name not in names}
+        return Kept(model.decoder, model.codes_of(names), prior_of(model.codes), others)
 
     def drawn(self, shapes: Int[Tensor, "some"]) -> Float[Tensor, "some length"]:
         """For each of the shapes a code anywhere between its own and a draw of the prior, and as usual as both."""
