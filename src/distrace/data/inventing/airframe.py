@@ -22,10 +22,8 @@ def fuselage(random: np.random.Generator, wide: float, nose: float, rear: float,
     last, slender = max(thick_end, random.uniform(0.06, 0.25)), random.uniform(0.8, 1.8)
     boxy = random.choice([2.0, random.uniform(2.0, 5.0)])
     fore = [(0.5 - nose * t, (1 - (1 - t) ** 2) ** blunt, -0.25 * (1 - t) ** 2) for t in np.linspace(0.01, 1, 8)]
-    aft = [
-        (rear * (1 - t) - 0.5, 1 - (1 - last) * t**slender, lift * (1 - last) * t**slender)
-        for t in np.linspace(0, 1, 7)
-    ]
+    thinned = [(t, (1 - last) * t**slender) for t in np.linspace(0, 1, 7)]
+    aft = [(rear * (1 - t) - 0.5, 1 - less, lift * less) for t, less in thinned]
     rings = [ring((0, rise * tall, z), wide * share, tall * share, boxy=boxy) for z, share, rise in fore + aft]
     return lofted(rings)
 
@@ -41,32 +39,34 @@ def wing(
     thick: float = 0.12,
 ) -> list[Part]:
     """A pair from the fuselage's axis outwards; its front edge begins at the height and place along that is given."""
-    y, z = place
-    back, up = np.tan(np.radians([sweep, dihedral]))
     kink, middle = random.uniform(0.25, 0.45), random.choice([0.0, random.uniform(0.0, 0.25)])
     chords = [(0.0, 1.0), (kink, 1 - (1 - taper) * kink - middle * (1 - taper) * (1 - kink)), (1.0, taper)]
 
     def section(out: float, share: float) -> Section:
-        front = (half * out, y + half * out * up, z - half * out * back)
+        front = front_edge(place, half * out, sweep, dihedral)
         return aerofoil(front, chord * share, thick * (1 - 0.3 * out))
 
     return both_sides(lofted([section(*rest) for rest in chords]))
 
 
+def front_edge(place: tuple[float, float], out: float, sweep: float, dihedral: float) -> tuple[float, float, float]:
+    """Where it is so far out, of a wing that begins at a height and a place along."""
+    (y, z), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
+    return out, y + out * up, z - out * back
+
+
 def winglets(place: tuple[float, float], half: float, chord: float, sweep: float, dihedral: float) -> list[Part]:
     """What stands up at the ends of a pair of wings whose root's front edge is at a place, `chord` long at the tips."""
-    (y, z), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
-    return both_sides([fin((half, y + half * up + 0.015, z - half * back), 0.35 * chord + 0.03, 0.8 * chord, 35, 0.2)])
+    x, y, z = front_edge(place, half, sweep, dihedral)
+    return both_sides([fin((x, y + 0.015, z), 0.35 * chord + 0.03, 0.8 * chord, 35, 0.2)])
 
 
 def tip_tanks(place: tuple[float, float], half: float, size: float, sweep: float, dihedral: float) -> list[Part]:
     """Slender ones at the ends of a pair of wings."""
-    (y, z), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
-    x, high, begin = half + 0.5 * size, y + half * up, z - half * back + 2 * size
-    sections = ((0.0, 0.1), (-2.0, 0.9), (-3.5, 1.0), (-5.5, 0.7), (-7.5, 0.1))
-    return both_sides(
-        [np.concatenate([ring((x, high, begin + t * size), r * size, r * size, 12) for t, r in sections])]
-    )
+    x, y, z = front_edge(place, half, sweep, dihedral)
+    sections = ((2.0, 0.1), (0.0, 0.9), (-1.5, 1.0), (-3.5, 0.7), (-5.5, 0.1))
+    rings = [ring((x + 0.5 * size, y, z + t * size), share * size, share * size, 12) for t, share in sections]
+    return both_sides([np.concatenate(rings)])
 
 
 def tail(random: np.random.Generator, wide: float, sweep: float, on_top: bool) -> list[Part]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from .airframe import both_sides, canopy, fin, fuselage, gear, jet, spinner, tail, tip_tanks, wing, winglets
+from .airframe import both_sides, canopy, fin, front_edge, fuselage, gear, jet, spinner, tail, tip_tanks, wing, winglets
 from .parts import Part, block, rod
 
 
@@ -45,10 +45,10 @@ def jets_beneath(
     random: np.random.Generator, place: tuple[float, float], half: float, size: float, sweep: float, dihedral: float
 ) -> list[Part]:
     """One or two on pylons below each half of a wing, which begins at a height and a place along."""
-    (y, at), (back, up) = place, np.tan(np.radians([sweep, dihedral]))
     parts = []
     for x in half * (random.choice([0.33, 0.3]) + 0.3 * np.arange(random.choice([1, 2], p=[0.8, 0.2]))):
-        z, under = at - x * back + random.uniform(0.02, 0.06), y + x * up - 1.15 * size
+        _, high, edge = front_edge(place, x, sweep, dihedral)
+        z, under = edge + random.uniform(0.02, 0.06), high - 1.15 * size
         parts.append(jet((x, under, z), size, random.uniform(0.08, 0.14)))
         parts.append(block((x - 0.004, under, z - 0.1), (x + 0.004, under + 1.3 * size, z), 0.003))
     return both_sides(parts)

@@ -16,7 +16,7 @@ def sofa(random: np.random.Generator, wide: float | None = None) -> list[Part]:
     arm = random.choice([0.0, random.uniform(0.04, 0.3)], p=[0.15, 0.85])
     inner, base = wide / 2 - arm, max(seat - cushion, floor + 0.04)
     seats = int(random.integers(1, max(round(wide / 0.5), 1) + 1))
-    soft, gap = random.uniform(0.01, cushion / 2.2), random.choice([0.0, random.uniform(0.003, 0.02)])
+    soft, gap = random.uniform(0.01, cushion / 2.2), apart(random)
 
     parts = [block((-wide / 2, floor, -deep / 2), (wide / 2, base, deep / 2), random.uniform(0.005, 0.04))]
     begin, end = -deep / 2 + thick / 2, deep / 2 + random.uniform(-0.03, 0.03)
@@ -34,6 +34,11 @@ def sofa(random: np.random.Generator, wide: float | None = None) -> list[Part]:
         place = (random.uniform(-0.8, 0.8) * max(inner - half[0], 0), seat + half[1] * 0.9, -deep / 2 + thick + 0.13)
         parts.append(tilted(block(-half, half, half[2] * 0.9), random.uniform(-25, -5)) + place)
     return parts
+
+
+def apart(random: np.random.Generator) -> float:
+    """The gap between cushions of a row: one in two has none."""
+    return random.choice([0.0, random.uniform(0.003, 0.02)])
 
 
 def back(
@@ -60,8 +65,7 @@ def back(
         begin = rear if style == "cushions" else rear + thick * 0.25
         top = high - random.uniform(-0.08, 0.1)
         number, soft = int(random.choice([seats, max(seats - 1, 1), seats + 1])), thick * random.uniform(0.15, 0.48)
-        gap = random.choice([0.0, random.uniform(0.003, 0.02)])
-        parts += row(number, (-half, seat - 0.05, begin), (half, top, begin + thick), soft, gap=gap)
+        parts += row(number, (-half, seat - 0.05, begin), (half, top, begin + thick), soft, gap=apart(random))
         parts.append(block((-half, base, rear), (half, seat, rear + thick), 0.01))
     return [tilted(part - hinge, lean) + hinge for part in parts]
 
