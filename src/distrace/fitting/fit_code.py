@@ -20,7 +20,7 @@ from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
-from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, passed, stages_of
+from distrace.fitting.starts import Starts, Step, best_of, by_last_loss, decided, passed, stages_of
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.losses import Weights
@@ -113,9 +113,7 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
     solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
     for step, _ in _stage(problem, w, None, solver, best.start, best.iteration):
         yield step
-    before, after = (_judged(problem.decoder, verdict, end) for end in (best, step))
-    seconds, evaluations = before.seconds + after.seconds, before.evaluations + after.evaluations
-    yield replace(min(before, after, key=lambda end: end.verdict), seconds=seconds, evaluations=evaluations)
+    yield decided([_judged(problem.decoder, verdict, end) for end in (best, step)])
 
 
 def fit_points(

@@ -140,7 +140,7 @@ def best_of(
         if _best(verdicts).verdict <= starts.doubtful:
             break
         verdicts.append(judge((yield from passed(run(start)))))
-    yield _charged(replace(_best(verdicts), seconds=0.0, evaluations=0), [*compared, *verdicts])
+    yield decided(verdicts, compared)
 
 
 def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
@@ -150,6 +150,11 @@ def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
     for step in steps:
         yield step
     return step
+
+
+def decided(ends: Sequence[Stepped], compared: Sequence[Stepped] = ()) -> Stepped:
+    """The best of judged ends, with what judging them, and all that was compared before, took."""
+    return _charged(replace(_best(ends), seconds=0.0, evaluations=0), [*compared, *ends])
 
 
 def _best(judged: Sequence[Stepped]) -> Stepped:
