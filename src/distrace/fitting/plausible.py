@@ -17,7 +17,7 @@ from distrace.data.view import View
 from distrace.decoder import FAR
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
-from distrace.fitting.starts import Step
+from distrace.fitting.starts import Step, charged
 from distrace.prior import DEVIATION, Prior, prior_of
 
 CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0, sharpening=0)
@@ -30,9 +30,8 @@ def plausible(
     prior, random = prior_of(model.codes), torch.Generator().manual_seed(seed)
     for number in range(count):
         draw = prior.code(DEVIATION * torch.randn(prior.basis.shape[1], generator=random).to(prior.mean))
-        *_, last = steps = list(completing(model, seen, replace(config, starts=1), Prior(draw, prior.basis)))
-        seconds, evaluations = (sum(getattr(step, name) for step in steps) for name in ("seconds", "evaluations"))
-        yield replace(last, start=number, seconds=seconds, evaluations=evaluations)
+        *steps, last = completing(model, seen, replace(config, starts=1), Prior(draw, prior.basis))
+        yield charged(replace(last, start=number), steps)
 
 
 @torch.no_grad()

@@ -128,7 +128,7 @@ def best_of(
     order = sorted(range(len(tried)), key=lambda start: compared[start].verdict)[: starts.kept]
     if len(order) == 1:
         going = runs[order[0]]
-        yield _charged(next(going, None) or unjudged(tried[order[0]][-1]), compared)  # it may have settled
+        yield charged(next(going, None) or unjudged(tried[order[0]][-1]), compared)  # it may have settled
         yield from going
         return
     ends = [tried[start][-1] for start in order]
@@ -154,14 +154,14 @@ def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
 
 def decided(ends: Sequence[Stepped], compared: Sequence[Stepped] = ()) -> Stepped:
     """The best of judged ends, with what judging them, and all that was compared before, took."""
-    return _charged(replace(_best(ends), seconds=0.0, evaluations=0), [*compared, *ends])
+    return charged(replace(_best(ends), seconds=0.0, evaluations=0), [*compared, *ends])
 
 
 def _best(judged: Sequence[Stepped]) -> Stepped:
     return min(judged, key=lambda step: step.verdict)
 
 
-def _charged(step: Stepped, judged: Sequence[Stepped]) -> Stepped:
-    """With what judging took."""
-    seconds, evaluations = (sum(getattr(each, spent) for each in judged) for spent in ("seconds", "evaluations"))
+def charged(step: Stepped, others: Sequence[Stepped]) -> Stepped:
+    """With what others took, too."""
+    seconds, evaluations = (sum(getattr(each, spent) for each in others) for spent in ("seconds", "evaluations"))
     return replace(step, seconds=step.seconds + seconds, evaluations=step.evaluations + evaluations)
