@@ -19,9 +19,9 @@ from distrace.data.placement import Placement
 from distrace.data.view import View
 from distrace.fitting import methods
 from distrace.fitting.fit import FitConfig
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.fit_samples import SampleFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of, told
+from distrace.fitting.staged import CodeFitConfig
 from distrace.pages import views_page
 from distrace.render import render
 from distrace.training.config import TrainConfig

@@ -14,11 +14,12 @@ from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
 from distrace.fitting.by_code import derivatives
 from distrace.fitting.code_residuals import Comparison, Problem
-from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
+from distrace.fitting.fit_code import fit_code, fit_points
 from distrace.fitting.nearest import Hints, first_of
 from distrace.fitting.point_residuals import PointProblem, misfit
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import SolverConfig, minimise
+from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step, stages_of
 from distrace.fitting.targets import Pool
 from distrace.losses import Weights
@@ -211,13 +212,30 @@ def test_the_best_of_several_starts_goes_on(decoder: Decoder, view: View) -> Non
 
 
 def test_the_end_that_contradicts_the_view_least_is_the_result(decoder: Decoder, view: View) -> None:
-    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=3, starts=3, trial=1)))
+    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=3, starts=3, trial=1, more=0)))
     ends = {step.start: step for step in steps}
     errors = {start: error(decoder, step.code) for start, step in ends.items()}
     assert steps[-1].start == min(errors, key=lambda start: errors[start])
     assert steps[-1].evaluations > 0, "judging asks the field, and that is counted"
     assert isfinite(steps[-1].verdict)
     assert steps[-1].verdict == min(step.verdict for step in steps)
+
+
+def test_a_doubtful_fit_hops_from_its_best_end_and_never_ends_worse(decoder: Decoder, view: View) -> None:
+    config = replace(CONFIG, iterations=2, starts=2, trial=1, kept=2, more=3, doubtful=-1.0, sharpening=0, hop=0.3)
+    steps = list(fit_code(decoder, [view], PRIOR, config))
+    assert {step.start for step in steps} == set(range(5))
+    few = last(fit_code(decoder, [view], PRIOR, replace(config, more=0)))
+    assert steps[-1].verdict <= few.verdict
+    enough = list(fit_code(decoder, [view], PRIOR, replace(config, doubtful=few.verdict)))
+    assert {step.start for step in enough} == {0, 1}
+
+    def begun(hop: float) -> float:
+        """How far the first step of the first further start ends from the best end so far."""
+        hopping = fit_code(decoder, [view], PRIOR, replace(config, hop=hop))
+        return next(float((step.code - few.code).norm()) for step in hopping if step.start == 2)
+
+    assert begun(0.0) < 0.5 * begun(5.0)
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])

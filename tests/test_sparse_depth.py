@@ -30,7 +30,7 @@ from distrace.evaluation.sparse_depth import (
     true_solid,
 )
 from distrace.evaluation.trials import Place
-from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.rays import meet_sphere

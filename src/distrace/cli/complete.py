@@ -16,7 +16,7 @@ from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.view import View, load_view
 from distrace.errors import explained
 from distrace.fitting.fit import FitConfig
-from distrace.fitting.fit_code import CodeFitConfig
+from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig
 
 OBSERVATIONS = files("distrace") / "observations"

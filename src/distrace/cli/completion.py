@@ -18,9 +18,9 @@ from distrace.evaluation.bench import poster_view
 from distrace.files import written
 from distrace.fitting.consistent import LEFT_OUT, completed
 from distrace.fitting.fit import FitConfig
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.plausible import plausible, spread
+from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step
 from distrace.mesh import MeshConfig
 from distrace.metrics import Chamfer, chamfer

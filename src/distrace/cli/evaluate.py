@@ -25,8 +25,8 @@ from distrace.evaluation.evaluate import (
     training_results,
 )
 from distrace.files import save_json, save_text
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import METHODS
+from distrace.fitting.staged import CodeFitConfig
 from distrace.pages.page import figure, page, section, table
 from distrace.processes import each_done
 

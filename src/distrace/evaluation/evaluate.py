@@ -17,8 +17,9 @@ from distrace.data.view import observe, pictured
 from distrace.evaluation.bench import poster_view
 from distrace.fitting.code_residuals import Comparison
 from distrace.fitting.consistent import completed
-from distrace.fitting.fit_code import CodeFitConfig, fit_points
+from distrace.fitting.fit_code import fit_points
 from distrace.fitting.methods import METHODS, steps_of, told
+from distrace.fitting.staged import CodeFitConfig
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer

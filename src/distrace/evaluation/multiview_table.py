@@ -28,7 +28,8 @@ from distrace.evaluation.semi_global import stereo_points
 from distrace.evaluation.sparse_depth import true_solid
 from distrace.evaluation.trials import fingerprint, grouped, hash_of, opened_once, read_json
 from distrace.files import save_json, written
-from distrace.fitting.fit_code import CodeFitConfig, fit_code
+from distrace.fitting.fit_code import fit_code
+from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos

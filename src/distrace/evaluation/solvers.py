@@ -17,7 +17,8 @@ from distrace.evaluation.bench import poster_view
 from distrace.evaluation.evaluate import OBSERVATION_SIZE
 from distrace.fitting.code_residuals import Comparison
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
-from distrace.fitting.fit_code import CodeFitConfig, fit_code
+from distrace.fitting.fit_code import fit_code
+from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step
 from distrace.fitting.targets import Pool
 from distrace.mesh import MeshConfig, extract_mesh

@@ -23,8 +23,8 @@ from distrace.data.view import View, observe
 from distrace.evaluation.trials import Place, fingerprint, hash_of, read_json
 from distrace.files import save_json
 from distrace.fitting.consistent import completed
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import settings_of, steps_of, told
+from distrace.fitting.staged import CodeFitConfig
 from distrace.metrics import chamfer
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")

@@ -14,9 +14,9 @@ from distrace.data.view import observe
 from distrace.evaluation.sparse_depth import camera_of, true_solid
 from distrace.evaluation.trials import hash_of, opened_once
 from distrace.fitting.consistent import completed
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.plausible import plausible, spread
+from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
 from distrace.processes import each_done

@@ -7,8 +7,9 @@ from distrace.data.cloud import Cloud
 from distrace.data.view import View
 from distrace.fitting.consistent import MARGIN
 from distrace.fitting.fit import FitConfig, fit_shape
-from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_points
+from distrace.fitting.fit_code import fit_code, fit_points
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples, on_surface
+from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step
 from distrace.prior import Prior, prior_of
 

@@ -15,8 +15,8 @@ from distrace.checkpoint import Model
 from distrace.data.cloud import Cloud
 from distrace.data.view import View
 from distrace.decoder import FAR
-from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.methods import completing
+from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step, charged
 from distrace.prior import DEVIATION, Prior, prior_of
 

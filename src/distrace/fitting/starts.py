@@ -21,7 +21,7 @@ class Starts:
     starts: int = 3
     trial: int = 20
     kept: int = 1  # starts that go on after the choice
-    more: int = 0  # other starts, where several go on, one after the other …
+    more: int = 0  # further starts, where several go on, one after the other …
     doubtful: float = 0.0  # … while the best end's verdict is above that
     seed: int = 0
 
@@ -108,11 +108,12 @@ def best_of(
     run: Callable[[int], Iterator[Stepped]],
     compare: Comparison[Stepped] = by_recent_losses,
     judge: Judge[Stepped] = unjudged,
+    further: Callable[[int, Stepped], Iterator[Stepped]] | None = None,
 ) -> Iterator[Stepped]:
     """The steps of all trials, then those of the starts whose verdicts are the least; the last step is the result.
 
-    Of several that go on the judge tells which is best, and whether more are tried: the best one's step is given again,
-    with what judging took.
+    Of several that go on the judge tells which is best, and whether more are tried, which may begin where the best one
+    has ended: its step is given again, with what judging took.
     """
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
@@ -137,9 +138,10 @@ def best_of(
             yield ends[k]
     verdicts = [judge(end) for end in ends]
     for start in range(starts.starts, starts.most):
-        if _best(verdicts).verdict <= starts.doubtful:
+        best = _best(verdicts)
+        if best.verdict <= starts.doubtful:
             break
-        verdicts.append(judge((yield from passed(run(start)))))
+        verdicts.append(judge((yield from passed(further(start, best) if further else run(start)))))
     yield decided(verdicts, compared)
 
 
