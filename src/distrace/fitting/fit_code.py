@@ -109,19 +109,20 @@ def _best(
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best.
 
-    Further starts hop from the best end (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997), and look at other
-    rays: where it contradicts what was seen, a better one is more often in the next valley than at another known shape.
+    Further starts are the next nearest training shapes or, where depths are too few to tell which these are, hop from
+    the best end and look at other rays (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
     """
-    first = first_of(decoder, prior, hints, config.starts, config.seed)
+    first = first_of(decoder, prior, hints, config.most, config.seed)
 
     def run(start: int) -> Iterator[Step]:
         return solved(problem_of, prior, config, start, first.coordinates[start])
 
-    def further(start: int, best: Step) -> Iterator[Step]:
+    def hop(start: int, best: Step) -> Iterator[Step]:
         other = replace(config, seed=config.seed + start)
         away = torch.randn(prior.basis.shape[1], generator=torch.Generator().manual_seed(other.seed)).to(best.code)
         return solved(problem_of, prior, other, start, prior.coordinates(best.code) + config.hop * away)
 
+    further = hop if hints.depths < DEPTHS else None
     steps = best_of(config, run, by_last_loss, partial(_judged, decoder, verdict), further)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)

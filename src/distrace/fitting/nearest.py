@@ -38,6 +38,11 @@ class Hints:
         distances = [seen.observed.new_full((len(some),), value) for some, value in zip(points, (0.0, torch.inf))]
         return Hints(torch.cat(points), torch.cat(distances))
 
+    @property
+    def depths(self) -> int:
+        """Points of the surface."""
+        return int((self.distances == 0).sum())
+
     @torch.no_grad()
     def contradicted(self, decoder: Decoder | Rounded, codes: Float[Tensor, "codes length"]) -> Float[Tensor, "codes"]:
         """How far, in the mean, each shape is from being as it is known to be."""

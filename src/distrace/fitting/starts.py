@@ -112,8 +112,8 @@ def best_of(
 ) -> Iterator[Stepped]:
     """The steps of all trials, then those of the starts whose verdicts are the least; the last step is the result.
 
-    Of several that go on the judge tells which is best, and whether more are tried, which may begin where the best one
-    has ended: its step is given again, with what judging took.
+    Of several that go on the judge tells which is best, and whether more are tried, which may begin at that one's end:
+    its step is given again, with what judging took.
     """
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
