@@ -63,19 +63,19 @@ def test_more_are_tried_while_no_end_is_good_enough(doubtful: float, tried: int,
     assert len(steps) == 2 * tried + 1 <= starts.total == 9
 
 
-def test_further_starts_are_told_which_end_is_the_best_so_far() -> None:
-    starts, told = Starts(iterations=2, starts=2, trial=1, kept=2, more=3), []
+def test_hops_come_last_and_are_told_which_end_is_the_best_so_far() -> None:
+    starts, told = Starts(iterations=2, starts=2, trial=1, kept=2, more=1, hops=2), []
     ends = [4.0, 2.0, 3.0, 1.0, 5.0]
 
     def going(start: int) -> Iterator[Step]:
         yield from (Step(start, iteration, ends[start], {}, torch.zeros(2), 1.0, 10) for iteration in (1, 2))
 
-    def further(start: int, best: Step) -> Iterator[Step]:
+    def hop(start: int, best: Step) -> Iterator[Step]:
         told.append((start, best.start))
         return going(start)
 
-    *_, last = best_of(starts, going, by_last_loss, further=further)
-    assert told == [(2, 1), (3, 1), (4, 3)]
+    *_, last = best_of(starts, going, by_last_loss, hop=hop)
+    assert told == [(3, 1), (4, 3)]
     assert last.start == 3
 
 

@@ -96,7 +96,7 @@ def fit_points(
     near = samples[samples[:, 3].abs() < FAR]
     some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
     others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0), verdict)
+    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0, hops=0), verdict)
 
 
 def _best(
@@ -109,10 +109,10 @@ def _best(
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best.
 
-    Further starts are the next nearest training shapes or, where depths are too few to tell which these are, hop from
-    the best end and look at other rays (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
+    Where depths are too few to tell which training shapes are near, it hops from the best end and looks at other rays
+    (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
     """
-    first = first_of(decoder, prior, hints, config.most, config.seed)
+    first = first_of(decoder, prior, hints, config.apart, config.seed)
 
     def run(start: int) -> Iterator[Step]:
         return solved(problem_of, prior, config, start, first.coordinates[start])
@@ -122,8 +122,8 @@ def _best(
         away = torch.randn(prior.basis.shape[1], generator=torch.Generator().manual_seed(other.seed)).to(best.code)
         return solved(problem_of, prior, other, start, prior.coordinates(best.code) + config.hop * away)
 
-    further = hop if hints.depths < DEPTHS else None
-    steps = best_of(config, run, by_last_loss, partial(_judged, decoder, verdict), further)
+    starts = config if hints.depths < DEPTHS else replace(config, hops=0)
+    steps = best_of(starts, run, by_last_loss, partial(_judged, decoder, verdict), hop)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps

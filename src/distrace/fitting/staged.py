@@ -29,8 +29,9 @@ class CodeFitConfig(Starts):
     iterations: int = 16
     kept: int = 3  # all of three starts: what a few iterations reach says little about the end
     more: int = 5
+    hops: int = 5  # where depths are few
     doubtful: float = 0.025  # depths off by that, in radii of the unit sphere, or a quarter of the silhouette
-    hop: float = 0.3  # by how many of the prior's deviations further starts leave the best end, where depths are few
+    hop: float = 0.3  # by how many of the prior's deviations these leave the best end
     stages: int = 4
     depth_rays: int = 1000  # of each view
     mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates

@@ -21,8 +21,9 @@ class Starts:
     starts: int = 3
     trial: int = 20
     kept: int = 1  # starts that go on after the choice
-    more: int = 0  # further starts, where several go on, one after the other …
-    doubtful: float = 0.0  # … while the best end's verdict is above that
+    more: int = 0  # further starts, where several go on, one after the other, …
+    hops: int = 0  # … and after these so many that begin at the best end, …
+    doubtful: float = 0.0  # … while that one's verdict is above this
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -41,9 +42,14 @@ class Starts:
         return min(self.kept, self.starts) if self.tried else 1
 
     @property
+    def apart(self) -> int:
+        """Starts, at most, that do not begin at another's end."""
+        return self.starts + (self.more if self.going_on > 1 else 0)
+
+    @property
     def most(self) -> int:
         """Starts, at most."""
-        return self.starts + (self.more if self.going_on > 1 else 0)
+        return self.apart + (self.hops if self.going_on > 1 else 0)
 
     @property
     def total(self) -> int:
@@ -108,12 +114,12 @@ def best_of(
     run: Callable[[int], Iterator[Stepped]],
     compare: Comparison[Stepped] = by_recent_losses,
     judge: Judge[Stepped] = unjudged,
-    further: Callable[[int, Stepped], Iterator[Stepped]] | None = None,
+    hop: Callable[[int, Stepped], Iterator[Stepped]] | None = None,
 ) -> Iterator[Stepped]:
     """The steps of all trials, then those of the starts whose verdicts are the least; the last step is the result.
 
-    Of several that go on the judge tells which is best, and whether more are tried, which may begin at that one's end:
-    its step is given again, with what judging took.
+    Of several that go on the judge tells which is best, and whether others are tried and, after these, some that hop
+    from it: its step is given again, with what judging took.
     """
     runs = [run(start) for start in range(starts.starts)]
     if not starts.tried:
@@ -141,7 +147,7 @@ def best_of(
         best = _best(verdicts)
         if best.verdict <= starts.doubtful:
             break
-        verdicts.append(judge((yield from passed(further(start, best) if further else run(start)))))
+        verdicts.append(judge((yield from passed(hop(start, best) if hop and start >= starts.apart else run(start)))))
     yield decided(verdicts, compared)
 
 
