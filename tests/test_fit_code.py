@@ -212,7 +212,7 @@ def test_the_best_of_several_starts_goes_on(decoder: Decoder, view: View) -> Non
 
 
 def test_the_end_that_contradicts_the_view_least_is_the_result(decoder: Decoder, view: View) -> None:
-    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=3, starts=3, trial=1, more=0)))
+    steps = list(fit_code(decoder, [view], PRIOR, replace(CONFIG, iterations=3, starts=3, trial=1)))
     ends = {step.start: step for step in steps}
     errors = {start: error(decoder, step.code) for start, step in ends.items()}
     assert steps[-1].start == min(errors, key=lambda start: errors[start])

@@ -28,8 +28,11 @@ class Prior:
 
     def start(self, k: int, seed: int) -> Float[Tensor, "dimensions"]:
         """The coordinates of the mean shape, and for k > 0 those of a draw: from nearer to the mean than shapes are."""
-        random = torch.Generator().manual_seed(seed + k)
-        return (torch.randn(self.basis.shape[1], generator=random) * (DEVIATION if k else 0.0)).to(self.mean)
+        return self.draw(torch.Generator().manual_seed(seed + k), DEVIATION if k else 0.0)
+
+    def draw(self, random: torch.Generator, deviation: float) -> Float[Tensor, "dimensions"]:
+        """Coordinates of a draw, in deviations of the prior."""
+        return (torch.randn(self.basis.shape[1], generator=random) * deviation).to(self.mean)
 
 
 def prior_of(codes: Float[Tensor, "shapes length"]) -> Prior:

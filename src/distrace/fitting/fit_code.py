@@ -119,8 +119,8 @@ def _best(
 
     def hop(start: int, best: Step) -> Iterator[Step]:
         other = replace(config, seed=config.seed + start)
-        away = torch.randn(prior.basis.shape[1], generator=torch.Generator().manual_seed(other.seed)).to(best.code)
-        return solved(problem_of, prior, other, start, prior.coordinates(best.code) + config.hop * away)
+        away = prior.draw(torch.Generator().manual_seed(other.seed), config.hop)
+        return solved(problem_of, prior, other, start, prior.coordinates(best.code) + away)
 
     starts = config if hints.depths < DEPTHS else replace(config, hops=0)
     steps = best_of(starts, run, by_last_loss, partial(_judged, decoder, verdict), hop)

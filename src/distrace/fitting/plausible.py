@@ -29,7 +29,7 @@ def plausible(
     """`count` completions; the step of each is its last one, and `start` its number."""
     prior, random = prior_of(model.codes), torch.Generator().manual_seed(seed)
     for number in range(count):
-        draw = prior.code(DEVIATION * torch.randn(prior.basis.shape[1], generator=random).to(prior.mean))
+        draw = prior.code(prior.draw(random, DEVIATION))
         *steps, last = completing(model, seen, replace(config, starts=1), Prior(draw, prior.basis))
         yield charged(replace(last, start=number), steps)
 
