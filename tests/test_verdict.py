@@ -1,5 +1,7 @@
 """What of a view a surface contradicts: depths up to a limit, and the share of the silhouette that is wrong."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -45,3 +47,12 @@ def test_outlines_that_are_off_do(radius: float) -> None:
 
 def test_no_ray_counts_for_more_than_it_can_tell() -> None:
     assert contradiction(sphere(0.01), seen(), TRACE) == pytest.approx(2 * MOST, rel=0.05)
+
+
+def test_noise_that_is_known_contradicts_nothing() -> None:
+    exact, random = seen(3000), torch.Generator().manual_seed(1)
+    off = 0.05 * torch.randn(len(exact.observed), generator=random)
+    noisy = replace(exact, observed=exact.observed + off, noise=0.05 * exact.known)
+    assert contradiction(sphere(0.5), noisy, TRACE) == pytest.approx(0, abs=4e-3)
+    assert contradiction(sphere(0.5), replace(noisy, noise=exact.noise), TRACE) > 0.03, "where it isn't known it does"
+    assert contradiction(sphere(0.6), noisy, TRACE) > 0.03

@@ -16,6 +16,7 @@ from distrace.field import SDF, Counted
 from distrace.fitting.code_residuals import Problem
 from distrace.fitting.fit import pools_of
 from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
+from distrace.fitting.noise_level import noise_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.seen import Seen
 from distrace.fitting.solver import SolverConfig
@@ -37,9 +38,11 @@ def fit_code(
     The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
+    noises = [noise_of(view) for view in views]
 
     def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
-        return Seen.of([pool.draw(depths, silhouette, random, touching) for pool in pools], config.compared.weights)
+        targets = [pool.draw(depths, silhouette, random, touching) for pool in pools]
+        return Seen.of(targets, config.compared.weights, noises)
 
     def problem(random: torch.Generator, share: float) -> Problem:
         some = seen(random, config.depth_rays, round(config.mask_rays * share))

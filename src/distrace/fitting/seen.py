@@ -22,16 +22,19 @@ class Seen:
     is_object: Bool[Tensor, "n"]
     weights: Float[Tensor, "n"]
     touches: Bool[Tensor, "n"]  # of object rays: along the outline, where the field is to vanish, not to be below zero
+    noise: Float[Tensor, "n"]  # the standard deviation of depths; 0 where too small to be told, or where there is none
 
     @staticmethod
-    def of(targets: Sequence[Targets], weights: Weights) -> "Seen":
+    def of(targets: Sequence[Targets], weights: Weights, noises: Sequence[float] | None = None) -> "Seen":
+        """Of each view what it targets, and how noisy its depths are: not at all, if nothing is said."""
         parts = []
-        for target in targets:
+        for target, noise in zip(targets, noises or [0.0] * len(targets), strict=True):
             rays, known = target.camera.rays(target.pixels), target.depth.isfinite()
             depth, mask = weights.depth / max(int(known.sum()), 1), weights.mask / max(len(known), 1)
             share = torch.where(known, depth, mask) / len(targets)
             observed = target.depth / target.camera.cosines(target.pixels)
-            parts.append((rays.origins, rays.directions, observed, target.is_object, share, target.touches))
+            noisy = known * target.depth.new_tensor(noise)
+            parts.append((rays.origins, rays.directions, observed, target.is_object, share, target.touches, noisy))
         origins, directions, *others = (torch.cat(part) for part in zip(*parts))
         rays = Rays(origins, directions)
         return Seen(rays, meet_sphere(rays), *others)
@@ -42,5 +45,5 @@ class Seen:
 
     def __getitem__(self, rows: Tensor) -> "Seen":
         bounds = Bounds(self.bounds.near[rows], self.bounds.far[rows])
-        images = (self.observed, self.is_object, self.weights, self.touches)
+        images = (self.observed, self.is_object, self.weights, self.touches, self.noise)
         return Seen(self.rays[rows], bounds, *(image[rows] for image in images))

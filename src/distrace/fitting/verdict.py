@@ -3,6 +3,7 @@
 import torch
 
 from distrace.field import SDF
+from distrace.fitting.noise_level import expected
 from distrace.fitting.seen import Seen
 from distrace.metrics import iou
 from distrace.trace import TraceConfig, sphere_trace
@@ -14,11 +15,13 @@ MOST = 0.1  # a depth that is off by more is as wrong as one that is missed, and
 def contradiction(sdf: SDF, seen: Seen, config: TraceConfig) -> float:
     """How far a surface is from the depths, in the mean; and, × `MOST`, the share of rays that it meets wrongly.
 
+    Noisy depths are off the true surface, too: what that makes is left out, so that a good fit to them is one.
     The share is of those that meet it or the object: one less their intersection over union. A fit's own loss tells
     worse which fit is good: it takes distances from the slope of the field, which are too large where rays graze the
     surface, and a single ray that misses a wing outweighs a hundred others.
     """
     trace = sphere_trace(sdf, seen.rays, seen.bounds, config)
     deviation = (trace.distance - seen.observed).abs().clamp_max(MOST).masked_fill(~trace.hit, MOST)
-    depth = deviation[seen.known].sum() / max(int(seen.known.sum()), 1)
+    beyond = (deviation - expected(seen.noise, MOST))[seen.known]
+    depth = beyond.sum() / max(int(seen.known.sum()), 1)
     return float(depth) + MOST * (1 - iou(trace.hit, seen.is_object))
