@@ -5,7 +5,7 @@ import torch
 
 import distrace.rounded
 from distrace.checkpoint import load_model
-from distrace.rounded import Rounded, quickest
+from distrace.rounded import ROWS, Rounded, quickest
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +31,14 @@ def test_both_ways_to_ask_agree(model) -> None:
         one, other = rounded(points, model.codes[:1]), rounded.field(model.codes[0])(points)
     assert one.dtype == other.dtype == torch.float32
     torch.testing.assert_close(one, other, atol=2e-3, rtol=0)
+
+
+@pytest.mark.parametrize("count", [0, 1, ROWS - 1, ROWS, ROWS + 1, 3 * ROWS])
+def test_rows_that_fill_up_a_batch_are_not_seen(model, count: int) -> None:
+    points = torch.rand(3 * ROWS, 3, generator=torch.Generator().manual_seed(2)) - 0.5
+    field = Rounded(model.decoder).field(model.codes[0])
+    assert field(points[:count]).shape == (count,)
+    torch.testing.assert_close(field(points[:count]), field(points)[:count], atol=2e-3, rtol=0)
 
 
 @pytest.mark.parametrize(("capabilities", "kind"), [({"avx512_bf16": True}, Rounded), ({"avx2": True}, None)])
