@@ -41,6 +41,14 @@ def test_rows_that_fill_up_a_batch_are_not_seen(model, count: int) -> None:
     torch.testing.assert_close(field(points[:count]), field(points)[:count], atol=2e-3, rtol=0)
 
 
+@pytest.mark.parametrize("shape", [(), (5,), (5, 7), (2, 0, 3)])
+def test_points_come_in_any_shape(model, shape: tuple[int, ...]) -> None:
+    points = torch.rand(*shape, 3, generator=torch.Generator().manual_seed(3)) - 0.5
+    field = Rounded(model.decoder).field(model.codes[0])
+    assert field(points).shape == shape
+    assert torch.equal(field(points).reshape(-1), field(points.reshape(-1, 3)))
+
+
 @pytest.mark.parametrize(("capabilities", "kind"), [({"avx512_bf16": True}, Rounded), ({"avx2": True}, None)])
 def test_only_a_processor_that_multiplies_so_is_asked_to(model, monkeypatch, capabilities, kind) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)

@@ -33,10 +33,12 @@ class Rounded:
             layers = [first, *((weight.bfloat16(), bias) for weight, bias in others)]
 
         @torch.no_grad()
-        def evaluate(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
-            rows = pad(points, (0, 0, 0, -len(points) % ROWS))
+        def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+            flat = points.reshape(-1, 3)
+            rows = pad(flat, (0, 0, 0, -len(flat) % ROWS))
             with torch.autocast(points.device.type, torch.bfloat16):
-                return self.decoder._run(layers, rows)[: len(points)].float()
+                values = self.decoder._run(layers, rows)
+            return values[: len(flat)].float().reshape(points.shape[:-1])
 
         return chunked(evaluate, CPU_CHUNK)
 
