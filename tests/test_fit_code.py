@@ -8,7 +8,7 @@ import pytest
 import torch
 from bumpy import bumpy_balls
 
-from distrace import rounded
+from distrace import quickest
 from distrace.camera import Camera
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
@@ -18,6 +18,7 @@ from distrace.fitting.fit_code import fit_code, fit_points
 from distrace.fitting.nearest import Hints, first_of
 from distrace.fitting.point_residuals import PointProblem, misfit
 from distrace.fitting.seen import Seen
+from distrace.fitting.side_by_side import Fields
 from distrace.fitting.solver import SolverConfig, minimise
 from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step, stages_of
@@ -49,7 +50,7 @@ def view(decoder: Decoder) -> View:
 @pytest.fixture
 def exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a processor without products in bfloat16, by which rays that graze are seen otherwise."""
-    monkeypatch.setattr(rounded, "_multiplies_in_bfloat16", lambda: False)
+    monkeypatch.setattr(quickest, "_multiplies_in_bfloat16", lambda: False)
 
 
 def last(steps: Iterator[Step]) -> Step:
@@ -59,7 +60,7 @@ def last(steps: Iterator[Step]) -> Step:
 
 def problem_of(decoder: Decoder, view: View, compared: Comparison) -> Problem:
     targets = Pool.of(view).draw(200, 200, torch.Generator().manual_seed(0))
-    return Problem(decoder, PRIOR, Seen.of([targets], compared.weights), compared)
+    return Problem(Fields(decoder), PRIOR, Seen.of([targets], compared.weights), compared)
 
 
 def error(decoder: Decoder, code: torch.Tensor) -> float:

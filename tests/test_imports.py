@@ -8,7 +8,18 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
     *("threads", "errors", "files", "processes", "rays", "camera", "pose"),
-    *("field", "steepness", "primitives", "decoder", "rounded", "experiment", "checkpoint", "prior"),
+    *(
+        "field",
+        "steepness",
+        "primitives",
+        "decoder",
+        "rounded",
+        "laid_out",
+        "quickest",
+        "experiment",
+        "checkpoint",
+        "prior",
+    ),
     *("trace", "pyramid", "fast", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photographs", "reconstruction"),

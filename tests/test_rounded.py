@@ -1,11 +1,17 @@
 """Products in bfloat16: as right as a fit can tell, and only where the processor has them."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
-import distrace.rounded
+import distrace.quickest
 from distrace.checkpoint import load_model
-from distrace.rounded import ROWS, Rounded, quickest
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.fitting.by_code import derivatives
+from distrace.laid_out import LaidOut
+from distrace.quickest import quickest
+from distrace.rounded import ROWS, Rounded
 
 
 @pytest.fixture(scope="module")
@@ -13,8 +19,13 @@ def model():
     return load_model("sofas")
 
 
-def test_near_the_surface_rounding_is_not_seen(model) -> None:
-    exact, rounded = model.field(0), Rounded(model.decoder).field(model.codes[0])
+@pytest.fixture(params=[Rounded, LaidOut])
+def form(request):
+    return request.param
+
+
+def test_near_the_surface_rounding_is_not_seen(model, form) -> None:
+    exact, rounded = model.field(0), form(model.decoder).field(model.codes[0])
     points = 1.6 * torch.rand(20_000, 3, generator=torch.Generator().manual_seed(0)) - 0.8
     with torch.no_grad():
         values = exact(points)
@@ -25,8 +36,8 @@ def test_near_the_surface_rounding_is_not_seen(model) -> None:
     assert off.max() < 5e-3
 
 
-def test_both_ways_to_ask_agree(model) -> None:
-    rounded, points = Rounded(model.decoder), torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) - 0.5
+def test_both_ways_to_ask_agree(model, form) -> None:
+    rounded, points = form(model.decoder), torch.rand(50, 3, generator=torch.Generator().manual_seed(1)) - 0.5
     with torch.no_grad():
         one, other = rounded(points, model.codes[:1]), rounded.field(model.codes[0])(points)
     assert one.dtype == other.dtype == torch.float32
@@ -34,29 +45,70 @@ def test_both_ways_to_ask_agree(model) -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1, ROWS - 1, ROWS, ROWS + 1, 3 * ROWS])
-def test_rows_that_fill_up_a_batch_are_not_seen(model, count: int) -> None:
+def test_rows_that_fill_up_a_batch_are_not_seen(model, form, count: int) -> None:
     points = torch.rand(3 * ROWS, 3, generator=torch.Generator().manual_seed(2)) - 0.5
-    field = Rounded(model.decoder).field(model.codes[0])
+    field = form(model.decoder).field(model.codes[0])
     assert field(points[:count]).shape == (count,)
     torch.testing.assert_close(field(points[:count]), field(points)[:count], atol=2e-3, rtol=0)
 
 
 @pytest.mark.parametrize("shape", [(), (5,), (5, 7), (2, 0, 3)])
-def test_points_come_in_any_shape(model, shape: tuple[int, ...]) -> None:
+def test_points_come_in_any_shape(model, form, shape: tuple[int, ...]) -> None:
     points = torch.rand(*shape, 3, generator=torch.Generator().manual_seed(3)) - 0.5
-    field = Rounded(model.decoder).field(model.codes[0])
+    field = form(model.decoder).field(model.codes[0])
     assert field(points).shape == shape
     assert torch.equal(field(points).reshape(-1), field(points.reshape(-1, 3)))
 
 
-@pytest.mark.parametrize(("capabilities", "kind"), [({"avx512_bf16": True}, Rounded), ({"avx2": True}, None)])
+def test_several_shapes_are_answered_as_each_alone(model, form) -> None:
+    rounded = form(model.decoder)
+    points = torch.rand(300, 3, generator=torch.Generator().manual_seed(4)) - 0.5
+    asked = [(rounded.layers(code), part) for code, part in zip(model.codes, points.split([5, 200, 0, 95]))]
+    for answer, code, (_, part) in zip(rounded.run(asked), model.codes, asked):
+        assert torch.equal(answer, rounded.field(code)(part))
+
+
+def test_laid_out_weights_give_what_autocast_gives(model) -> None:
+    points = torch.rand(500, 3, generator=torch.Generator().manual_seed(5)) - 0.5
+    found, usual = (form(model.decoder).field(model.codes[1])(points) for form in (LaidOut, Rounded))
+    torch.testing.assert_close(found, usual, atol=2e-3, rtol=0)
+    assert (found == usual).float().mean() > 0.98
+
+
+@pytest.mark.parametrize("use_tanh", [False, True])
+@pytest.mark.parametrize("latent_in", [(), (2,), (1, 3)])
+def test_slopes_are_those_of_autograd(latent_in: tuple[int, ...], use_tanh: bool) -> None:
+    torch.manual_seed(0)
+    specs = NetworkSpecs((64,) * 4, 8, latent_in, norm_layers=(0, 1), use_tanh=use_tanh)
+    decoder = Decoder(specs).eval().requires_grad_(False)
+    points, code = torch.rand(77, 3) - 0.5, torch.randn(8)
+    assert LaidOut.has(decoder)
+    exact, quick = derivatives(decoder, points, code), derivatives(LaidOut(decoder), points, code)
+    torch.testing.assert_close(quick[0], exact[0], atol=1e-6, rtol=1e-5)
+    for found, true in zip(quick[1:], exact[1:], strict=True):
+        assert found.shape == true.shape
+        assert (found - true).norm() < 0.01 * true.norm()
+
+
+@pytest.mark.parametrize("specs", [{"weight_norm": False}, {"xyz_in_all": True, "norm_layers": ()}])
+def test_other_layers_are_run_as_they_are(specs: dict) -> None:
+    torch.manual_seed(0)
+    decoder = Decoder(replace(NetworkSpecs((64,) * 4, 8, (2,)), **specs)).eval().requires_grad_(False)
+    points, code, rounded = torch.rand(50, 3) - 0.5, torch.randn(8), Rounded(decoder)
+    assert not LaidOut.has(decoder)
+    torch.testing.assert_close(rounded.field(code)(points), decoder.field(code)(points), atol=2e-2, rtol=0)
+    for found, true in zip(derivatives(rounded, points, code), derivatives(decoder, points, code), strict=True):
+        assert torch.equal(found, true)
+
+
+@pytest.mark.parametrize(("capabilities", "kind"), [({"avx512_bf16": True}, LaidOut), ({"avx2": True}, None)])
 def test_only_a_processor_that_multiplies_so_is_asked_to(model, monkeypatch, capabilities, kind) -> None:
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities, raising=False)
-    distrace.rounded._multiplies_in_bfloat16.cache_clear()
+    distrace.quickest._multiplies_in_bfloat16.cache_clear()
     try:
         assert type(quickest(model.decoder)) is (kind or type(model.decoder))
     finally:
-        distrace.rounded._multiplies_in_bfloat16.cache_clear()
+        distrace.quickest._multiplies_in_bfloat16.cache_clear()
 
 
 def test_doubles_stay_doubles(model) -> None:

@@ -1,16 +1,19 @@
 """A decoder's products in bfloat16: half the time where the processor has them, and as right as a fit can tell."""
 
-from functools import lru_cache
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.decoder import CPU_CHUNK, Decoder, Layer
 from distrace.field import SDF, chunked
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
+
+Asked = tuple[list[Layer], Float[Tensor, "_ 3"]]
+"""A shape's layers, and points to have its values at."""
 
 
 class Rounded:
@@ -28,34 +31,29 @@ class Rounded:
 
     def field(self, code: Float[Tensor, "length"]) -> SDF:
         """The field of one shape, without derivatives by what it was made from."""
-        with torch.no_grad():
-            first, *others = self.decoder.field(code).layers  # points enter the first, in full precision
-            layers = [first, *((weight.bfloat16(), bias) for weight, bias in others)]
+        layers = self.layers(code)
 
         @torch.no_grad()
         def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-            flat = points.reshape(-1, 3)
-            rows = pad(flat, (0, 0, 0, -len(flat) % ROWS))
-            with torch.autocast(points.device.type, torch.bfloat16):
-                values = self.decoder._run(layers, rows)
-            return values[: len(flat)].float().reshape(points.shape[:-1])
+            return self.run([(layers, points.reshape(-1, 3))])[0].reshape(points.shape[:-1])
 
         return chunked(evaluate, CPU_CHUNK)
 
+    @torch.no_grad()
+    def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
+        """Those of the field of one shape."""
+        return self.decoder.field(code).layers
 
-def quickest(decoder: Decoder) -> Decoder | Rounded:
-    """The decoder as it is, or rounded: on a CPU that multiplies in bfloat16. Others emulate that, and take longer.
+    @torch.no_grad()
+    def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
+        """Values of several shapes, each at its points."""
+        return [self._run_one(layers, filled(points))[: len(points)].float() for layers, points in asked]
 
-    A decoder of another class is asked as it is: it may have another field.
-    """
-    parameter = next(decoder.parameters())
-    if type(decoder) is not Decoder or parameter.device.type != "cpu" or parameter.dtype != torch.float32:
-        return decoder
-    return Rounded(decoder) if _multiplies_in_bfloat16() else decoder
+    def _run_one(self, layers: list[Layer], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        with torch.autocast(points.device.type, torch.bfloat16):
+            return self.decoder._run(layers, points)
 
 
-@lru_cache
-def _multiplies_in_bfloat16() -> bool:
-    """As the processor says it, not a stopwatch: so that a fit that is run again ends where it did."""
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # PyTorch before 2.10 does not tell
-    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))
+def filled(points: Float[Tensor, "n 3"], others: int = 0) -> Float[Tensor, "m 3"]:
+    """With zeros after them, so that these and others make a multiple of `ROWS`."""
+    return pad(points, (0, 0, 0, -(len(points) + others) % ROWS))

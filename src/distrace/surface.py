@@ -159,7 +159,7 @@ def minimum_and_value(
             break
         ray, middle, w, lowest, highest = flat[going], t[going], width[going], near[going], far[going]
         before, after = (middle - w).maximum(lowest), (middle + w).minimum(highest)
-        left, right = sdf(ray.at(before)), sdf(ray.at(after))
+        left, right = sdf(ray.at(torch.stack([before, after])))
         curvature = (left - 2 * value[going] + right).clamp_min(torch.finfo(t.dtype).tiny)
         offset = 0.5 * w * (left - right) / curvature
         vertex = (middle + offset.clamp(-w, w)).clamp(lowest, highest)

@@ -182,51 +182,44 @@ class _March:
 
     def _advance(self, at: Tensor, value: Tensor, config: TraceConfig) -> None:
         t, near, tolerance = self.t[at], self.near[at], self.tolerance[at]
+        last_value = self.last_value[at]
+        to_zero = -value * (t - self.last_t[at]) / (value - last_value)  # of the line through this sample and the last
         converged = value.abs() < tolerance
         inside = (t <= near) & (value < 0) & ~converged
         step = config.step_scale * value.clamp(-config.step_limit, config.step_limit)
         step = torch.where(value > 0, step.clamp_min(config.least_step), step)
-        following = self._bracketed(at, value, (t + step).maximum(near))
+        # Where step_scale · |f'| along the ray is near 2 or above, the march would bounce about the zero.
+        bounces = (value * last_value < 0) & (value.abs() > 0.7 * last_value.abs())
+        following = self._bracketed(at, t, value, torch.where(bounces, t + to_zero, (t + step).maximum(near)))
         escaped = (following > self.far[at]) & ~converged
         outcome = torch.full_like(self.outcome[at], -1)
         ends = ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT))
         for reached, name in (*ends, (value.isnan(), Outcome.EXHAUSTED)):
             outcome = outcome.masked_fill(reached, int(name))
         self.outcome[at] = outcome
-        end = (t + self._to_zero(at, value)).clamp(near, self.far[at]) if config.polish else t
+        end = (t + _polish(value, to_zero)).clamp(near, self.far[at]) if config.polish else t
         self.t[at] = torch.where(converged, end, torch.where(outcome == -1, following, t))
         self.last_t[at], self.last_value[at] = t, value
 
-    def _bracketed(self, at: Tensor, value: Tensor, proposed: Tensor) -> Tensor:
-        """The proposed distance; but between two samples of different sign that hardly come closer, the secant to zero,
-        and the middle of a sign change that would be jumped out of.
-
-        Where step_scale · |f'| along the ray is near 2 or above, the march would bounce about the zero.
-        """
-        t, last = self.t[at], self.last_value[at]
-        bounces = (value * last < 0) & (value.abs() > 0.7 * last.abs())
-        proposed = torch.where(bounces, t + self._to_secant(at, value), proposed)
+    def _bracketed(self, at: Tensor, t: Tensor, value: Tensor, proposed: Tensor) -> Tensor:
+        """The proposed distance, but the middle of a sign change that would be jumped out of."""
         inside = torch.where(value < 0, t.minimum(self.inside[at]), self.inside[at])
         outside = torch.where((value > 0) & (t < inside), t, self.outside[at])
         self.inside[at], self.outside[at] = inside, outside
         jumps = (inside < torch.inf) & (outside > -torch.inf) & ((proposed <= outside) | (proposed >= inside))
         return torch.where(jumps, (outside + inside) / 2, proposed)
 
-    def _to_zero(self, at: Tensor, value: Tensor) -> Tensor:
-        """From a converged sample to the zero of the secant; else by the value itself.
-
-        The latter on a first sample (where the secant is NaN, which compares false) and along the surface: a step by
-        the distance never leads too far.
-        """
-        move = self._to_secant(at, value)
-        return torch.where(move.abs() <= 20 * value.abs(), move, value)
-
-    def _to_secant(self, at: Tensor, value: Tensor) -> Tensor:
-        """From a sample to the zero of the line through it and the one before."""
-        return -value * (self.t[at] - self.last_t[at]) / (value - self.last_value[at])
-
     def result(self) -> Trace:
         outcome = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED))
         hit = outcome == Outcome.HIT
         closest = torch.where(hit, self.t, self.closest)
         return Trace(self.t.masked_fill(~hit, torch.inf), outcome, closest, self.t, self.evaluations)
+
+
+def _polish(value: Tensor, to_zero: Tensor) -> Tensor:
+    """From a converged sample to the zero of the secant; else by the value itself.
+
+    The latter on a first sample (where the secant is NaN, which compares false) and along the surface: a step by the
+    distance never leads too far.
+    """
+    return torch.where(to_zero.abs() <= 20 * value.abs(), to_zero, value)

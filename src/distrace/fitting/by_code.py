@@ -6,6 +6,8 @@ from torch import Tensor
 
 from distrace.decoder import CPU_CHUNK, Decoder
 from distrace.fitting.solver import Residuals
+from distrace.laid_out import LaidOut
+from distrace.rounded import Rounded
 
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
 PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
@@ -28,17 +30,21 @@ def with_prior(
 
 
 def derivatives(
-    decoder: Decoder, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
+    decoder: Decoder | Rounded, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
-    """Values, and their derivatives by the point and by the code: every point has a copy of the code for its own."""
+    """Exact values, and their derivatives by the point and by the code: as right as the decoder has them."""
     parts = [_derivatives(decoder, part, code) for part in points.split(PART)]
     values, by_point, by_code = (torch.cat(part) for part in zip(*parts))
     return values, by_point, by_code
 
 
 @torch.enable_grad()
-def _derivatives(decoder: Decoder, points: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def _derivatives(decoder: Decoder | Rounded, points: Tensor, code: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    if isinstance(decoder, LaidOut):
+        return decoder.slopes(points, code)
+    if isinstance(decoder, Rounded):
+        decoder = decoder.decoder
     points, codes = points.detach().requires_grad_(), code.detach().repeat(len(points), 1).requires_grad_()
-    values = decoder(points, codes)
+    values = decoder(points, codes)  # every point has a copy of the code for its own
     by_point, by_code = torch.autograd.grad(values.sum(), (points, codes))
     return values.detach(), by_point, by_code

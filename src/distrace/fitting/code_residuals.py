@@ -6,15 +6,14 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from distrace.decoder import Decoder
 from distrace.field import SDF, Counted
 from distrace.fitting.by_code import derivatives, with_prior
 from distrace.fitting.seen import Seen
+from distrace.fitting.side_by_side import Fields
 from distrace.fitting.solver import Residuals
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.rays import Bounds
-from distrace.rounded import quickest
 from distrace.surface import minimum_and_value
 from distrace.trace import TraceConfig, sphere_trace
 
@@ -53,7 +52,7 @@ class Look:
 class Problem:
     """Residuals of a code's coordinates on fixed rays; and how often all that has asked for the field."""
 
-    decoder: Decoder
+    fields: Fields  # rounded where that is faster; residuals are not
     prior: Prior
     seen: Seen
     config: Comparison
@@ -100,8 +99,7 @@ class Problem:
         return Look(w, t, hit, compared, look.watched, look.scale)
 
     def _field(self, w: Float[Tensor, "dimensions"]) -> Counted:
-        """To look along rays by, rounded where that is faster; residuals are not."""
-        return Counted(quickest(self.decoder).field(self.prior.code(w)))
+        return Counted(self.fields.field(self.prior.code(w)))
 
     def _met(self, sdf: Counted, seen: Seen, near: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Bool[Tensor, "n"]]:
         """Where rays meet the surface, and whether they do; those with a depth are followed no farther than that."""
@@ -118,7 +116,7 @@ class Problem:
         """
         seen, rows = self.seen, look.compared.nonzero()[:, 0]
         rays, t = seen.rays[rows], look.distance[rows]
-        values, gradient, by_code = derivatives(self.decoder, rays.at(t), self.prior.code(look.w))
+        values, gradient, by_code = derivatives(self.fields.quick, rays.at(t), self.prior.code(look.w))
         self.evaluations += len(values)
         slope, known = (gradient * rays.directions).sum(-1).abs(), seen.known[rows]
         before = torch.where(known, t - seen.observed[rows], 0.0)

@@ -19,13 +19,13 @@ from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.noise_level import noise_of
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
 from distrace.fitting.seen import Seen
+from distrace.fitting.side_by_side import Fields, Groups
 from distrace.fitting.solver import SolverConfig
 from distrace.fitting.staged import CodeFitConfig, ProblemOf, solved, stage_of
-from distrace.fitting.starts import Step, best_of, by_last_loss, decided, passed
+from distrace.fitting.starts import Step, best_of, by_last_loss, decided, ended, passed
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.prior import Prior
-from distrace.rounded import quickest
 
 Verdict = Callable[[SDF, Step], float]
 
@@ -38,7 +38,7 @@ def fit_code(
     The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-    noises = [noise_of(view) for view in views]
+    noises, fields = [noise_of(view) for view in views], Fields(decoder)
 
     def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
         targets = [pool.draw(depths, silhouette, random, touching) for pool in pools]
@@ -46,7 +46,7 @@ def fit_code(
 
     def problem(random: torch.Generator, share: float) -> Problem:
         some = seen(random, config.depth_rays, round(config.mask_rays * share))
-        return Problem(decoder, prior, some, config.compared)
+        return Problem(fields, prior, some, config.compared)
 
     others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
 
@@ -54,12 +54,12 @@ def fit_code(
         return contradiction(sdf, others, config.compared.trace)
 
     random = torch.Generator().manual_seed(config.seed)
-    steps = _best(decoder, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
+    steps = _best(fields, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
     if not config.sharpening or not any(len(pool.between) for pool in pools):
         return steps
     random = torch.Generator().manual_seed(config.seed + 2)
     sharp = seen(random, config.depth_rays, config.mask_rays // 2, config.outline_rays)
-    return _then_sharpened(steps, Problem(decoder, prior, sharp, config.compared), config, verdict)
+    return _then_sharpened(steps, Problem(fields, prior, sharp, config.compared), config, verdict)
 
 
 def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Verdict) -> Iterator[Step]:
@@ -72,7 +72,7 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
     solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
     for step, _ in stage_of(problem, w, None, solver, best.start, best.iteration):
         yield step
-    yield decided([_judged(problem.decoder, verdict, end) for end in (best, step)])
+    yield decided([_judged(problem.fields, verdict, end) for end in (best, step)])
 
 
 def fit_points(
@@ -99,11 +99,13 @@ def fit_points(
     near = samples[samples[:, 3].abs() < FAR]
     some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
     others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    return _best(decoder, prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0, hops=0), verdict)
+    return _best(
+        Fields(decoder), prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0, hops=0), verdict
+    )
 
 
 def _best(
-    decoder: Decoder,
+    fields: Fields,
     prior: Prior,
     hints: Hints,
     problem_of: ProblemOf,
@@ -115,27 +117,28 @@ def _best(
     Where depths are too few to tell which training shapes are near, it hops from the best end and looks at other rays
     (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
     """
-    first = first_of(decoder, prior, hints, config.apart, config.seed)
+    first, judge = first_of(fields.quick, prior, hints, config.apart, config.seed), partial(_judged, fields, verdict)
 
-    def run(start: int) -> Iterator[Step]:
-        return solved(problem_of, prior, config, start, first.coordinates[start])
+    def fit(start: int) -> Iterator[Step]:
+        return ended(solved(problem_of, prior, config, start, first.coordinates[start]), judge)
 
     def hop(start: int, best: Step) -> Iterator[Step]:
         other = replace(config, seed=config.seed + start)
         away = prior.draw(torch.Generator().manual_seed(other.seed), config.hop)
         return solved(problem_of, prior, other, start, prior.coordinates(best.code) + away)
 
+    groups = Groups(fields, fit, [range(config.starts), range(config.starts, config.apart)])
     starts = config if hints.depths < DEPTHS else replace(config, hops=0)
-    steps = best_of(starts, run, by_last_loss, partial(_judged, decoder, verdict), hop)
+    steps = best_of(starts, groups.steps, by_last_loss, judge, hop)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps
 
 
-def _judged(decoder: Decoder, verdict: Verdict, step: Step) -> Step:
+def _judged(fields: Fields, verdict: Verdict, step: Step) -> Step:
     """A step with the verdict on its shape, and what that took: nothing, where it has one."""
     if isfinite(step.verdict):
         return replace(step, seconds=0.0, evaluations=0)
-    began, sdf = time.perf_counter(), Counted(quickest(decoder).field(step.code))
+    began, sdf = time.perf_counter(), Counted(fields.field(step.code))
     judged = replace(step, verdict=verdict(sdf, step))
     return replace(judged, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)

@@ -11,7 +11,7 @@ from torch import Tensor
 from distrace.decoder import FAR, Decoder
 from distrace.fitting.seen import Seen
 from distrace.prior import Prior
-from distrace.rounded import Rounded, quickest
+from distrace.rounded import Rounded
 
 DEPTHS, SILHOUETTE = 100, 300  # rays of a view that hints are taken from
 FREE = 3.0  # × counts, in the mean, what is inside and should not be: a point in the free space seldom says anything
@@ -66,10 +66,10 @@ class First:
     evaluations: int
 
 
-def first_of(decoder: Decoder, prior: Prior, hints: Hints, count: int, seed: int) -> First:
+def first_of(decoder: Decoder | Rounded, prior: Prior, hints: Hints, count: int, seed: int) -> First:
     """The mean's coordinates, those of the nearest training codes and, if these are too few, draws."""
     began = time.perf_counter()
-    codes, evaluations = _nearest(quickest(decoder), prior.codes, hints, count - 1)
+    codes, evaluations = _nearest(decoder, prior.codes, hints, count - 1)
     nearest = [prior.coordinates(code) for code in codes]
     draws = [prior.start(k, seed) for k in range(len(nearest) + 1, count)]
     return First([prior.start(0, seed), *nearest, *draws], time.perf_counter() - began, evaluations)

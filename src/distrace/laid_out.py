@@ -1,0 +1,129 @@
+"""A plain decoder, of products, biases and ReLUs alone, as oneDNN multiplies fastest."""
+
+from collections.abc import Sequence
+from functools import cached_property
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from distrace.decoder import Decoder, Layer
+from distrace.rounded import ROWS, Asked, Rounded, filled
+
+PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
+
+
+class LaidOut(Rounded):
+    """To the bit as autocast has it, but for a value in ten thousand, in half the time.
+
+    Weights are laid out once, not at every product, and a product adds its bias and bends by itself.
+    """
+
+    @staticmethod
+    def has(decoder: Decoder) -> bool:
+        """Whether it has a decoder's layers: not those that are normed or all fed, nor where PyTorch lacks products."""
+        specs = decoder.specs
+        normed = bool(specs.norm_layers) and not specs.weight_norm
+        return not (normed or specs.xyz_in_all or decoder.training) and hasattr(PRODUCTS, "_linear_pointwise")
+
+    @torch.no_grad()
+    def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
+        """Those of the field of one shape; of the ones that are fed code and points, only what multiplies points."""
+        return [self._folded(*layer, code) if self._is_fed(k) else layer for k, layer in enumerate(self._layers)]
+
+    def _folded(self, weight: Tensor, bias: Tensor, code: Tensor) -> Layer:
+        return weight[:, -3:], F.linear(code, weight[:, -self._fed : -3], bias)
+
+    @torch.no_grad()
+    def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
+        """Values of several shapes, each at its points, by one product a layer."""
+        counts = [len(points) for _, points in asked]
+        layers, points = asked[-1]
+        values = self._run_all([*asked[:-1], (layers, filled(points, sum(counts[:-1])))])
+        return list(values[: sum(counts)].float().split(counts))
+
+    def _run_all(self, asked: Sequence[Asked]) -> Float[Tensor, "n"]:
+        x, last = _placed(asked, 0).relu_(), len(self._layers) - 1
+        for number, weight in enumerate(self._weights, 1):
+            if self._is_fed(number):
+                x = _product(x, weight).add_(_placed(asked, number)).relu_()
+            else:
+                x = _product(x, weight, self._layers[number][1], "relu" if number < last else "none")
+        x = x[:, 0]
+        return torch.tanh(torch.tanh(x) if self.decoder.specs.use_tanh else x)
+
+    @torch.no_grad()
+    def slopes(
+        self, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
+        """Exact values, and their derivatives by the point and by the code, rounded on the way back alone."""
+        layers, on, rows = self.decoder.field(code).layers, [], filled(points)
+        x = rows[:, :0]
+        for number, layer in enumerate(layers):
+            x = F.linear(torch.cat([x, rows], dim=1) if self._is_fed(number) else x, *layer)
+            if number < len(layers) - 1:
+                on.append(x > 0)
+                x = x.relu_()
+        x, by_units = x[:, 0], layers[-1][0].expand(len(rows), -1)
+        for _ in range(2 if self.decoder.specs.use_tanh else 1):
+            x = x.tanh()
+            by_units = by_units * (1 - x.square())[:, None]
+        by_fed = rows.new_zeros(len(rows), self._fed)
+        for number in range(len(on) - 1, -1, -1):
+            by_units = by_units.bfloat16() * on[number]
+            units, fed = self._weights_back[number]
+            if fed is not None:
+                by_fed += _product(by_units, fed)
+            if units is not None:
+                by_units = _product(by_units, units)
+        by_code, by_point = by_fed[: len(points)].split([self._fed - 3, 3], dim=1)
+        return x[: len(points)], by_point, by_code
+
+    @cached_property
+    def _layers(self) -> list[Layer]:
+        """Weights, and biases in the precision that they are added in."""
+        linears = [getattr(self.decoder, f"lin{layer}") for layer in range(self.decoder.depth)]
+        layers = [(linear.weight.detach(), linear.bias.detach()) for linear in linears]
+        return [(w, b if self._is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
+
+    @cached_property
+    def _weights(self) -> list[Tensor]:
+        """Of all layers but the first, without what multiplies code and points, as oneDNN has them for a product."""
+        return [_laid_out(self._of_units(layer)) for layer in range(1, self.decoder.depth)]
+
+    @cached_property
+    def _weights_back(self) -> list[tuple[Tensor | None, Tensor | None]]:
+        """Of all layers but the last, from its outputs to the units before it, and to code and points."""
+        layers = range(self.decoder.depth - 1)
+        units = [_laid_out(self._of_units(layer).T) if layer else None for layer in layers]
+        fed = [
+            _laid_out(self._layers[layer][0][:, -self._fed :].T) if self._is_fed(layer) else None for layer in layers
+        ]
+        return list(zip(units, fed, strict=True))
+
+    @property
+    def _fed(self) -> int:
+        return self.decoder.specs.code_length + 3
+
+    def _of_units(self, layer: int) -> Tensor:
+        """A layer's weights of the units before it."""
+        weight = self._layers[layer][0]
+        return weight[:, : -self._fed] if self._is_fed(layer) else weight
+
+    def _is_fed(self, layer: int) -> bool:
+        """Code and points."""
+        return layer == 0 or layer in self.decoder.specs.latent_in
+
+
+def _laid_out(weight: Tensor) -> Tensor:
+    return PRODUCTS._reorder_linear_weight(weight.bfloat16().contiguous(), 4 * ROWS)
+
+
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, then: str = "none") -> Tensor:
+    return PRODUCTS._linear_pointwise(x, weight, bias, then, [], "")
+
+
+def _placed(asked: Sequence[Asked], layer: int) -> Float[Tensor, "n width"]:
+    """What points, in full precision, and the codes that are folded into biases give to a layer that is fed them."""
+    return torch.cat([F.linear(points, *layers[layer]) for layers, points in asked]).bfloat16()
