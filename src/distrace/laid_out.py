@@ -38,16 +38,18 @@ class LaidOut(Rounded):
     @torch.no_grad()
     def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
         """Values of several shapes, each at its points, by one product a layer."""
-        counts = [len(points) for _, points in asked]
-        layers, points = asked[-1]
-        values = self._run_all([*asked[:-1], (layers, filled(points, sum(counts[:-1])))])
-        return list(values[: sum(counts)].float().split(counts))
+        counts = torch.tensor([len(points) for _, points in asked])
+        whose = torch.eye(len(asked)).repeat_interleave(counts, 0)
+        rows = filled(torch.cat([torch.cat([points for _, points in asked]), whose], dim=1))
+        values = self._run_all([layers for layers, _ in asked], rows)[: len(whose)]
+        return list(values.float().split(counts.tolist()))
 
-    def _run_all(self, asked: Sequence[Asked]) -> Float[Tensor, "n"]:
-        x, last = _placed(asked, 0).relu_(), len(self._layers) - 1
+    def _run_all(self, shapes: Sequence[list[Layer]], rows: Float[Tensor, "n inputs"]) -> Float[Tensor, "n"]:
+        """Of points, each beside a one for its shape and zeros for the others."""
+        x, last = _placed(rows, shapes, 0).relu_(), len(self._layers) - 1
         for number, weight in enumerate(self._weights, 1):
             if self._is_fed(number):
-                x = _product(x, weight).add_(_placed(asked, number)).relu_()
+                x = _product(x, weight).add_(_placed(rows, shapes, number)).relu_()
             else:
                 x = _product(x, weight, self._layers[number][1], "relu" if number < last else "none")
         x = x[:, 0]
@@ -124,6 +126,7 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, then: str = 
     return PRODUCTS._linear_pointwise(x, weight, bias, then, [], "")
 
 
-def _placed(asked: Sequence[Asked], layer: int) -> Float[Tensor, "n width"]:
+def _placed(rows: Float[Tensor, "n inputs"], shapes: Sequence[list[Layer]], number: int) -> Float[Tensor, "n width"]:
     """What points, in full precision, and the codes that are folded into biases give to a layer that is fed them."""
-    return torch.cat([F.linear(points, *layers[layer]) for layers, points in asked]).bfloat16()
+    weight, biases = shapes[0][number][0], [layers[number][1] for layers in shapes]
+    return F.linear(rows, torch.cat([weight, torch.stack(biases, dim=1)], dim=1)).bfloat16()

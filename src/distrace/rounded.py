@@ -54,6 +54,6 @@ class Rounded:
             return self.decoder._run(layers, points)
 
 
-def filled(points: Float[Tensor, "n 3"], others: int = 0) -> Float[Tensor, "m 3"]:
-    """With zeros after them, so that these and others make a multiple of `ROWS`."""
-    return pad(points, (0, 0, 0, -(len(points) + others) % ROWS))
+def filled(rows: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
+    """With rows of zeros after them, up to a multiple of `ROWS`."""
+    return pad(rows, (0, 0, 0, -len(rows) % ROWS))
