@@ -84,3 +84,15 @@ def test_a_group_runs_when_its_first_is_wanted() -> None:
     assert begun == [0, 1]
     list(groups.steps(4))
     assert begun == [0, 1, 2, 3, 4]
+
+
+def test_what_runs_in_vain_is_charged_too() -> None:
+    fields = Fields(MODEL.decoder)
+    groups = Groups(fields, lambda number: asking(fields, number, 2), [range(3)])
+    wanted = list(groups.steps(0))
+    unwanted = [step for number in (1, 2) for step in groups.done[number]]
+    charged = groups.charge(wanted[-1])
+    assert charged.seconds == pytest.approx(sum(step.seconds for step in unwanted))
+    assert charged.loss == wanted[-1].loss
+    list(groups.steps(1)), list(groups.steps(2))
+    assert groups.charge(wanted[-1]).seconds == 0

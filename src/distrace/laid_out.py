@@ -65,15 +65,14 @@ class LaidOut(Rounded):
         for number, layer in enumerate(layers):
             x = F.linear(torch.cat([x, rows], dim=1) if self._is_fed(number) else x, *layer)
             if number < len(layers) - 1:
-                on.append(x > 0)
-                x = x.relu_()
+                on.append(x.relu_().sign().bfloat16())
         x, by_units = x[:, 0], layers[-1][0].expand(len(rows), -1)
         for _ in range(2 if self.decoder.specs.use_tanh else 1):
             x = x.tanh()
             by_units = by_units * (1 - x.square())[:, None]
         by_fed = rows.new_zeros(len(rows), self._fed)
         for number in range(len(on) - 1, -1, -1):
-            by_units = by_units.bfloat16() * on[number]
+            by_units = by_units.bfloat16().mul_(on[number])
             units, fed = self._weights_back[number]
             if fed is not None:
                 by_fed += _product(by_units, fed)

@@ -129,7 +129,7 @@ def _best(
 
     groups = Groups(fields, fit, [range(config.starts), range(config.starts, config.apart)])
     starts = config if hints.depths < DEPTHS else replace(config, hops=0)
-    steps = best_of(starts, groups.steps, by_last_loss, judge, hop)
+    steps = ended(best_of(starts, groups.steps, by_last_loss, judge, hop), groups.charge)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps

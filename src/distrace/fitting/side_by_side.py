@@ -16,7 +16,7 @@ from torch import Tensor
 
 from distrace.decoder import CPU_CHUNK, Decoder, Layer
 from distrace.field import SDF
-from distrace.fitting.starts import Stepped
+from distrace.fitting.starts import Stepped, charged
 from distrace.quickest import quickest
 from distrace.rounded import Asked, Rounded
 
@@ -84,13 +84,20 @@ class Groups(Generic[Stepped]):
     def __init__(self, fields: Fields, fit: Callable[[int], Iterator[Stepped]], groups: Sequence[range]) -> None:
         self.fields, self.fit, self.groups = fields, fit, groups
         self.done: dict[int, list[Stepped]] = {}
+        self.wanted: set[int] = set()
 
     def steps(self, number: int) -> Iterator[Stepped]:
         """Of the fit of this number."""
         if number not in self.done:
             group = next(group for group in self.groups if number in group)
             self.done |= zip(group, self.fields.side_by_side([self.fit(each) for each in group]), strict=True)
+        self.wanted.add(number)
         yield from self.done[number]
+
+    def charge(self, step: Stepped) -> Stepped:
+        """A step with what only those fits took that ran beside others and were not wanted."""
+        unwanted = [each for number, steps in self.done.items() if number not in self.wanted for each in steps]
+        return charged(replace(step, seconds=0.0, evaluations=0), unwanted)
 
 
 def _switched(other: greenlet, value: object) -> Any:

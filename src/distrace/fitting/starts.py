@@ -161,7 +161,7 @@ def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
 
 
 def ended(steps: Iterator[Stepped], judge: Judge[Stepped]) -> Iterator[Stepped]:
-    """All of them, the last one judged."""
+    """All of them, the last one judged and charged with that."""
     step = next(steps)
     for following in steps:
         yield step
