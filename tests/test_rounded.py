@@ -90,7 +90,9 @@ def test_slopes_are_those_of_autograd(latent_in: tuple[int, ...], use_tanh: bool
         assert (found - true).norm() < 0.01 * true.norm()
 
 
-@pytest.mark.parametrize("specs", [{"weight_norm": False}, {"xyz_in_all": True, "norm_layers": ()}])
+@pytest.mark.parametrize(
+    "specs", [{"weight_norm": False}, {"xyz_in_all": True, "norm_layers": ()}, {"latent_in": (2, 4)}]
+)
 def test_other_layers_are_run_as_they_are(specs: dict) -> None:
     torch.manual_seed(0)
     decoder = Decoder(replace(NetworkSpecs((64,) * 4, 8, (2,)), **specs)).eval().requires_grad_(False)

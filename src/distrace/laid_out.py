@@ -22,10 +22,11 @@ class LaidOut(Rounded):
 
     @staticmethod
     def has(decoder: Decoder) -> bool:
-        """Whether it has a decoder's layers: not those that are normed or all fed, nor where PyTorch lacks products."""
+        """Whether it has a decoder's layers: none normed, not all fed, nor the last; and PyTorch the products."""
         specs = decoder.specs
         normed = bool(specs.norm_layers) and not specs.weight_norm
-        return not (normed or specs.xyz_in_all or decoder.training) and hasattr(PRODUCTS, "_linear_pointwise")
+        other = normed or specs.xyz_in_all or len(specs.dims) in specs.latent_in or decoder.training
+        return not other and torch.backends.mkldnn.is_available() and hasattr(PRODUCTS, "_linear_pointwise")
 
     @torch.no_grad()
     def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
