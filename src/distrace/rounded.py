@@ -41,8 +41,9 @@ class Rounded:
 
     @torch.no_grad()
     def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
-        """Those of the field of one shape."""
-        return self.decoder.field(code).layers
+        """Those of the field of one shape, their weights rounded once, not at every product."""
+        first, *others = self.decoder.field(code).layers  # points enter the first, in full precision
+        return [first, *((weight.bfloat16(), bias) for weight, bias in others)]
 
     @torch.no_grad()
     def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:

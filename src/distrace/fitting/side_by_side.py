@@ -14,8 +14,8 @@ from greenlet import getcurrent, greenlet
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.decoder import CPU_CHUNK, Decoder, Layer
-from distrace.field import SDF
+from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.field import SDF, chunked
 from distrace.fitting.starts import Stepped, charged
 from distrace.quickest import quickest
 from distrace.rounded import Asked, Rounded
@@ -37,15 +37,10 @@ class Fields:
         layers = self.quick.layers(code)
 
         def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-            parts = points.reshape(-1, 3).split(CPU_CHUNK)
-            return torch.cat([self._ask(layers, part) for part in parts]).reshape(points.shape[:-1])
+            assert self.hub is not None
+            return _switched(self.hub, (layers, points.reshape(-1, 3))).reshape(points.shape[:-1])
 
-        return evaluate
-
-    def _ask(self, layers: list[Layer], points: Float[Tensor, "_ 3"]) -> Values:
-        """Switches to the hub, and back with an answer."""
-        assert self.hub is not None
-        return _switched(self.hub, (layers, points))
+        return chunked(evaluate, CPU_CHUNK)
 
     def side_by_side(self, fits: Sequence[Iterator[Stepped]]) -> list[list[Stepped]]:
         """All steps of each. The time that these took is shared out among them."""
