@@ -113,10 +113,6 @@ class LaidOut(Rounded):
         weight = self._layers[layer][0]
         return weight[:, : -self._fed] if self._is_fed(layer) else weight
 
-    def _is_fed(self, layer: int) -> bool:
-        """Code and points."""
-        return layer == 0 or layer in self.decoder.specs.latent_in
-
 
 def _laid_out(weight: Tensor) -> Tensor:
     return PRODUCTS._reorder_linear_weight(weight.bfloat16().contiguous(), 4 * ROWS)

@@ -41,9 +41,14 @@ class Rounded:
 
     @torch.no_grad()
     def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
-        """Those of the field of one shape, their weights rounded once, not at every product."""
-        first, *others = self.decoder.field(code).layers  # points enter the first, in full precision
-        return [first, *((weight.bfloat16(), bias) for weight, bias in others)]
+        """Those of the field of one shape, rounded once, not at every product, but where points enter."""
+        layers = enumerate(self.decoder.field(code).layers)
+        return [(w if self._is_fed(number) else w.bfloat16(), b) for number, (w, b) in layers]
+
+    def _is_fed(self, layer: int) -> bool:
+        """Code and points, or points alone."""
+        specs = self.decoder.specs
+        return layer == 0 or layer in specs.latent_in or specs.xyz_in_all
 
     @torch.no_grad()
     def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
