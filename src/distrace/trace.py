@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -120,43 +121,53 @@ def sphere_trace(
     return march.result().reshaped(rays.shape)
 
 
+class _State(NamedTuple):
+    """What is known of rays on their way; `_March` keeps it as one image, so that few reads serve all."""
+
+    t: Float[Tensor, "n"]
+    last_t: Float[Tensor, "n"]  # the sample before, for the secant
+    last_value: Float[Tensor, "n"]
+    outside: Float[Tensor, "n"]  # the last sample with f > 0 before `inside`, for the bracket
+    inside: Float[Tensor, "n"]  # the first with f < 0
+    least: Float[Tensor, "n"]  # |sdf| at `closest`
+    closest: Float[Tensor, "n"]
+
+    def sampled(self, value: Float[Tensor, "n"], magnitude: Float[Tensor, "n"]) -> "_State":
+        """With f where the rays stand: the bracket and the nearest sample follow."""
+        t, nearer = self.t, magnitude < self.least
+        inside = torch.where(value < 0, t.minimum(self.inside), self.inside)
+        outside = torch.where((value > 0) & (t < inside), t, self.outside)
+        least, closest = torch.where(nearer, magnitude, self.least), torch.where(nearer, t, self.closest)
+        return _State(t, t, value, outside, inside, least, closest)
+
+    def bracketed(self, proposed: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        """The proposed distance, but the middle of a sign change that would be jumped out of."""
+        jumps = (self.inside < torch.inf) & (self.outside > -torch.inf)
+        jumps &= (proposed <= self.outside) | (proposed >= self.inside)
+        return torch.where(jumps, (self.outside + self.inside) / 2, proposed)
+
+
 @dataclass
 class _March:
-    """The state of all rays that meet the bounds, flat."""
+    """All rays that meet the bounds, flat."""
 
     rays: Rays
-    near: Tensor
-    far: Tensor
-    tolerance: Tensor
-    t: Tensor
-    last_t: Tensor  # the sample before, for the secant
-    last_value: Tensor
-    outside: Tensor  # the last sample with f > 0 before `inside`, for the bracket
-    inside: Tensor  # the first with f < 0
-    least: Tensor  # |sdf| at `closest`
-    closest: Tensor
-    outcome: Tensor  # -1: still on its way
-    evaluations: Tensor
+    limits: Float[Tensor, "3 n"]  # near, far, tolerance
+    state: Float[Tensor, "7 n"]
+    outcome: Int[Tensor, "n"]  # -1: still on its way
+    evaluations: Int[Tensor, "n"]
 
     @staticmethod
     def begin(rays: Rays, bounds: Bounds, config: TraceConfig, start: Tensor | None) -> "_March":
         near, far = bounds.near.reshape(-1), bounds.far.reshape(-1)
         meets = near < far
-        t = near if start is None else start.reshape(-1).clamp(near, far)
-        nothing = torch.full_like(near, torch.nan)
+        t = torch.where(meets, near if start is None else start.reshape(-1).clamp(near, far), torch.inf)
         tolerance = torch.as_tensor(config.tolerance, dtype=near.dtype, device=near.device)
+        unknown, infinite = torch.full_like(near, torch.nan), torch.full_like(near, torch.inf)
         return _March(
             rays,
-            near,
-            far,
-            tolerance.expand(bounds.near.shape).reshape(-1),
-            torch.where(meets, t, torch.inf),
-            last_t=nothing,
-            last_value=nothing.clone(),
-            outside=torch.full_like(near, -torch.inf),
-            inside=torch.full_like(near, torch.inf),
-            least=torch.full_like(near, torch.inf),
-            closest=torch.where(meets, t, torch.inf),
+            limits=torch.stack([near, far, tolerance.expand(bounds.near.shape).reshape(-1)]),
+            state=torch.stack(_State(t, unknown, unknown, -infinite, infinite, infinite, t)),
             outcome=torch.where(meets, -1, int(Outcome.ESCAPED)),
             evaluations=torch.zeros_like(near, dtype=torch.int64),
         )
@@ -166,54 +177,48 @@ class _March:
         under_way = (self.outcome == -1).nonzero()[:, 0]
         if not len(under_way):
             return False
-        queried = under_way if config.compaction else (self.near < self.far).nonzero()[:, 0]
+        queried = under_way if config.compaction else (self.limits[0] < self.limits[1]).nonzero()[:, 0]
         self.evaluations[queried] += 1
-        value = asked(sdf, self.rays[queried].at(self.t[queried]))
+        value = asked(sdf, self.rays[queried].at(self.state[0, queried]))
         if not config.compaction:
             value = value[self.outcome[queried] == -1]
-        self._record(under_way, value)
-        self._advance(under_way, value, config)
+        outcome, state = _advanced(_State(*self.state[:, under_way]), value, self.limits[:, under_way], config)
+        self.outcome[under_way], self.state[:, under_way] = outcome, torch.stack(state)
         return True
 
-    def _record(self, at: Tensor, value: Tensor) -> None:
-        nearer = value.abs() < self.least[at]
-        self.least[at] = torch.where(nearer, value.abs(), self.least[at])
-        self.closest[at] = torch.where(nearer, self.t[at], self.closest[at])
-
-    def _advance(self, at: Tensor, value: Tensor, config: TraceConfig) -> None:
-        t, near, tolerance = self.t[at], self.near[at], self.tolerance[at]
-        last_value = self.last_value[at]
-        to_zero = -value * (t - self.last_t[at]) / (value - last_value)  # of the line through this sample and the last
-        converged = value.abs() < tolerance
-        inside = (t <= near) & (value < 0) & ~converged
-        step = config.step_scale * value.clamp(-config.step_limit, config.step_limit)
-        step = torch.where(value > 0, step.clamp_min(config.least_step), step)
-        # Where step_scale · |f'| along the ray is near 2 or above, the march would bounce about the zero.
-        bounces = (value * last_value < 0) & (value.abs() > 0.7 * last_value.abs())
-        following = self._bracketed(at, t, value, torch.where(bounces, t + to_zero, (t + step).maximum(near)))
-        escaped = (following > self.far[at]) & ~converged
-        outcome = torch.full_like(self.outcome[at], -1)
-        ends = ((escaped, Outcome.ESCAPED), (inside, Outcome.INSIDE), (converged, Outcome.HIT))
-        for reached, name in (*ends, (value.isnan(), Outcome.EXHAUSTED)):
-            outcome = outcome.masked_fill(reached, int(name))
-        self.outcome[at] = outcome
-        end = (t + _polish(value, to_zero)).clamp(near, self.far[at]) if config.polish else t
-        self.t[at] = torch.where(converged, end, torch.where(outcome == -1, following, t))
-        self.last_t[at], self.last_value[at] = t, value
-
-    def _bracketed(self, at: Tensor, t: Tensor, value: Tensor, proposed: Tensor) -> Tensor:
-        """The proposed distance, but the middle of a sign change that would be jumped out of."""
-        inside = torch.where(value < 0, t.minimum(self.inside[at]), self.inside[at])
-        outside = torch.where((value > 0) & (t < inside), t, self.outside[at])
-        self.inside[at], self.outside[at] = inside, outside
-        jumps = (inside < torch.inf) & (outside > -torch.inf) & ((proposed <= outside) | (proposed >= inside))
-        return torch.where(jumps, (outside + inside) / 2, proposed)
-
     def result(self) -> Trace:
-        outcome = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED))
+        outcome, state = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED)), _State(*self.state)
         hit = outcome == Outcome.HIT
-        closest = torch.where(hit, self.t, self.closest)
-        return Trace(self.t.masked_fill(~hit, torch.inf), outcome, closest, self.t, self.evaluations)
+        closest = torch.where(hit, state.t, state.closest)
+        return Trace(state.t.masked_fill(~hit, torch.inf), outcome, closest, state.t, self.evaluations)
+
+
+def _advanced(
+    state: _State, value: Float[Tensor, "n"], limits: Float[Tensor, "3 n"], config: TraceConfig
+) -> tuple[Int[Tensor, "n"], _State]:
+    """What became of rays whose field is `value` where they stand, and where they stand then."""
+    (near, far, tolerance), magnitude, t = limits, value.abs(), state.t
+    to_zero = -value * (t - state.last_t) / (value - state.last_value)  # of the line through this sample and the last
+    proposed = _proposed(state, value, to_zero, config).maximum(near)
+    state = state.sampled(value, magnitude)
+    following, converged = state.bracketed(proposed), magnitude < tolerance
+    outcome = torch.full_like(value, -1, dtype=torch.int64)
+    ends = ((following > far) & ~converged, Outcome.ESCAPED), ((t <= near) & (value < 0) & ~converged, Outcome.INSIDE)
+    for reached, name in (*ends, (converged, Outcome.HIT), (value.isnan(), Outcome.EXHAUSTED)):
+        outcome.masked_fill_(reached, int(name))
+    end = (t + _polish(value, to_zero)).clamp(near, far) if config.polish else t
+    return outcome, state._replace(t=torch.where(converged, end, torch.where(outcome == -1, following, t)))
+
+
+def _proposed(state: _State, value: Tensor, to_zero: Tensor, config: TraceConfig) -> Float[Tensor, "n"]:
+    """Where a step by the value leads; or, where that would bounce about the zero, the secant's.
+
+    It would where step_scale · |f'| along the ray is near 2 or above.
+    """
+    step = config.step_scale * value.clamp(-config.step_limit, config.step_limit)
+    step = torch.where(value > 0, step.clamp_min(config.least_step), step)
+    bounces = (value * state.last_value < 0) & (value.abs() > 0.7 * state.last_value.abs())
+    return state.t + torch.where(bounces, to_zero, step)
 
 
 def _polish(value: Tensor, to_zero: Tensor) -> Tensor:

@@ -22,6 +22,7 @@ ATTENTION = 0.025  # rays of the background that come closer than this are searc
 WATCHED = 0.075  # … and those that come closer than this after each step; the others when a scale changes
 REACH, ROUNDS = 0.05, 2  # to two thousandths, at first; …
 NEAR, ROUNDS_NEAR = 0.02, 1  # … a step moves it little
+ROUNDED = 0.005  # by more no value is off that is looked for rounded
 GRAZING = 0.1  # depths on rays that meet the surface more flatly count as if they met it so
 
 
@@ -79,9 +80,11 @@ class Problem:
         free[aside], close[aside] = values < ATTENTION, values < WATCHED
         lacking = ~seen.known & seen.is_object & seen.bounds.meets & (~hit | seen.touches)
         wrong = free | lacking
-        t[wrong], _ = _lowest(sdf, seen[wrong], t[wrong])
+        t[wrong], values = _lowest(sdf, seen[wrong], t[wrong])
+        compared = seen.known.clone()
+        compared[wrong] = self._amiss(seen[wrong], values)
         self.evaluations += sdf.evaluations
-        return Look(w, t, hit, seen.known | wrong, seen.known | close | lacking, self.scale)
+        return Look(w, t, hit, compared, seen.known | close | lacking, self.scale)
 
     @torch.no_grad()
     def moved(self, look: Look, step: Float[Tensor, "dimensions"]) -> Look:
@@ -94,9 +97,13 @@ class Problem:
         seen = self.seen[rows]
         t[rows], values = _lowest(sdf, seen, t[rows], NEAR, ROUNDS_NEAR)
         hit[rows] = values <= 0
-        compared[rows] = seen.touches | torch.where(seen.is_object, values > 0, values < ATTENTION)
+        compared[rows] = self._amiss(seen, values)
         self.evaluations += sdf.evaluations
         return Look(w, t, hit, compared, look.watched, look.scale)
+
+    def _amiss(self, seen: Seen, least: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:
+        """Which rays without a depth disagree with the mask, or may, for their least values are rounded; or touch."""
+        return seen.touches | torch.where(seen.is_object, least > 0, least < self.config.margin + ROUNDED)
 
     def _field(self, w: Float[Tensor, "dimensions"]) -> Counted:
         return Counted(self.fields.field(self.prior.code(w)))
