@@ -19,7 +19,7 @@ from distrace.fitting.nearest import Hints, first_of
 from distrace.fitting.point_residuals import PointProblem, misfit
 from distrace.fitting.seen import Seen
 from distrace.fitting.side_by_side import Fields
-from distrace.fitting.solver import SolverConfig, minimise
+from distrace.fitting.solver import SolverConfig, cauchy, minimise
 from distrace.fitting.staged import CodeFitConfig
 from distrace.fitting.starts import Step, stages_of
 from distrace.fitting.targets import Pool
@@ -102,6 +102,18 @@ def test_residuals_change_as_their_jacobian_says(decoder: Decoder, view: View) -
     expected = one.jacobian[[rows.index(row) for row in both]] @ step
     assert (change - expected).abs().median() < 0.05 * expected.abs().median()
     assert one.jacobian.shape == (len(rows) + 4, 4), "the prior's rows are the last"
+
+
+def test_rays_that_are_left_out_would_change_no_step(decoder: Decoder, view: View) -> None:
+    """Rays of the background that come near, but not too near, and rays of the object that meet it."""
+    problem = problem_of(decoder, view.sparse(20), CONFIG.compared)
+    look = problem.moved(problem.look(torch.zeros(4)), torch.tensor([0.3, -0.2, 0.1, 0.2]))
+    more = replace(look, compared=look.watched)
+    some, every = problem.residuals(look), problem.residuals(more)
+    assert len(some.values) + 20 < len(every.values), "they were differentiated in vain"
+    assert some.loss(problem.scale) == pytest.approx(every.loss(problem.scale))
+    (step, _), (other, _) = (each.step(problem.scale, 0.1, cauchy, even=True) for each in (some, every))
+    torch.testing.assert_close(step, other)
 
 
 def test_an_observed_shape_lacks_nothing(decoder: Decoder, view: View) -> None:
