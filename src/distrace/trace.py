@@ -172,6 +172,11 @@ class _March:
             evaluations=torch.zeros_like(near, dtype=torch.int64),
         )
 
+    @property
+    def rows(self) -> _State:
+        """The state by its names."""
+        return _State(*self.state)
+
     def step(self, sdf: SDF, config: TraceConfig) -> bool:
         """One query of the rays on their way (or of all); False once there are none."""
         under_way = (self.outcome == -1).nonzero()[:, 0]
@@ -179,7 +184,7 @@ class _March:
             return False
         queried = under_way if config.compaction else (self.limits[0] < self.limits[1]).nonzero()[:, 0]
         self.evaluations[queried] += 1
-        value = asked(sdf, self.rays[queried].at(self.state[0, queried]))
+        value = asked(sdf, self.rays[queried].at(self.rows.t[queried]))
         if not config.compaction:
             value = value[self.outcome[queried] == -1]
         outcome, state = _advanced(_State(*self.state[:, under_way]), value, self.limits[:, under_way], config)
@@ -187,10 +192,10 @@ class _March:
         return True
 
     def result(self) -> Trace:
-        outcome, state = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED)), _State(*self.state)
+        outcome, t = self.outcome.masked_fill(self.outcome == -1, int(Outcome.EXHAUSTED)), self.rows.t
         hit = outcome == Outcome.HIT
-        closest = torch.where(hit, state.t, state.closest)
-        return Trace(state.t.masked_fill(~hit, torch.inf), outcome, closest, state.t, self.evaluations)
+        closest = torch.where(hit, t, self.rows.closest)
+        return Trace(t.masked_fill(~hit, torch.inf), outcome, closest, t, self.evaluations)
 
 
 def _advanced(
