@@ -60,6 +60,15 @@ def test_a_package_gives_its_files(tmp_path, packing):
     assert (tmp_path / "out/usr/a.txt").read_bytes() == b"hello"
 
 
+def test_of_a_package_folders_can_be_picked_and_what_is_elsewhere_does_not_matter(tmp_path):
+    names = "./usr/a/x.txt", "usr/a/deep/y.txt", "usr/ab.txt", "usr/doc/copyright"
+    members = [(member(name), b"") for name in names] + [(member("usr/door", tarfile.SYMTYPE, "/etc"), b"")]
+    unpack_deb(deb(tmp_path / "a.deb", *members), tmp_path / "out", below=("usr/a", "usr/doc"))
+    assert written(tmp_path / "out") == {"usr/a/x.txt", "usr/a/deep/y.txt", "usr/doc/copyright"}
+    with pytest.raises(ValueError, match="would land outside"):
+        unpack_deb(deb(tmp_path / "b.deb", (member("usr/a/../../../b"), b"")), tmp_path / "out", below=("usr/a",))
+
+
 def test_a_zip_gives_its_files_and_empty_folders(tmp_path):
     unpack_zip(zipped(tmp_path / "a.zip", **{"x/a.txt": "hello", "y/": "", "b": ""}), tmp_path / "out")
     assert written(tmp_path / "out") == {"x/a.txt", "b"}

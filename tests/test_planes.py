@@ -7,7 +7,7 @@ import pytest
 from test_furniture import write_deb
 
 from distrace.data.ac3d import load_ac3d, load_surfaces
-from distrace.data.planes import catalogue, prepare
+from distrace.data.planes import catalogue, parked, prepare, prepare_parked
 from distrace.data.solid import load_solid, load_soup
 
 HEAD = 'AC3Db\nMATERIAL "" rgb 1 1 1  amb 1 1 1  emis 0 0 0  spec 0 0 0  shi 0  trans 0\n'
@@ -134,3 +134,26 @@ def test_another_package_is_refused(tmp_path: Path) -> None:
     other = write_deb(tmp_path / "other.deb", {"doc/other/copyright": b""})
     with pytest.raises(ValueError, match=r"other.deb holds no aircraft .*--from FILE\.deb"):
         catalogue(other, tmp_path / "out")
+
+
+def test_each_parked_mesh_is_listed_with_its_images_and_nothing_else_of_the_package(tmp_path: Path) -> None:
+    root = "games/flightgear/Scenery/Models"
+    mesh = HEAD + poly([TRIANGLE], 'texture "skin.png"\n')
+    files = {
+        f"{root}/Aircraft/jet.ac": mesh,
+        f"{root}/Aircraft/skin.png": "skin",
+        f"{root}/Aircraft/unused.png": "unused",
+        f"{root}/Aircraft/trailer.ac": HEAD + poly([TRIANGLE]),
+        f"{root}/Airport/tower.ac": HEAD + poly([TRIANGLE]),
+    }
+    deb = write_deb(tmp_path / "flightgear-data-base_1_all.deb", {name: text.encode() for name, text in files.items()})
+    meshes = prepare_parked(tmp_path / "out", deb)
+    assert [(mesh.name, mesh.licence) for mesh in meshes] == [(name, "GPL-2.0-or-later") for name in ("jet", "trailer")]
+    assert all(len(load_ac3d(tmp_path / "out" / mesh.path)) for mesh in meshes)
+    kept = {path.name for path in (tmp_path / "out/flightgear-data-base").iterdir()}
+    assert kept == {"jet.ac", "skin.png", "trailer.ac", "unpacked-from.txt"}
+
+
+def test_a_package_without_parked_aircraft_is_refused(deb: Path, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"holds no aircraft .*flightgear-data-base and pass --from FILE\.deb"):
+        parked(deb, tmp_path / "out")

@@ -3,7 +3,6 @@
 import json
 import math
 from dataclasses import asdict, replace
-from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +14,13 @@ from distrace import primitives
 from distrace.data import sampling
 from distrace.data.samples import THIN, Doubt, doubt, lost, sample, write_samples
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, normalised_frame
-from distrace.data.split import Shape, every_mesh, read_split
+from distrace.data.split import CLASSES, Shape, every_mesh, read_split
 from distrace.training.batches import load_samples
 
 CUBE = RADIUS / math.sqrt(3) * 2  # the edge of a normalised cube
 COUNT = 5000
 NEAR = 1566  # of the samples, at each deviation from the surface
 COLUMNS = "name,split,design,turn,path,creator,licence"
-BUNDLED = sorted(item.name.removesuffix(".csv") for item in (files("distrace") / "splits").iterdir())
 
 
 def plain(mesh: trimesh.Trimesh) -> Solid:
@@ -270,7 +268,7 @@ def test_a_shape_whose_samples_are_gone_is_sampled_anew(folder: Path, reports: d
 # ---- splits
 
 
-@pytest.mark.parametrize("name", BUNDLED)
+@pytest.mark.parametrize("name", CLASSES)
 def test_in_a_bundled_split_each_design_is_on_one_side_and_each_shape_is_free(name: str) -> None:
     shapes = read_split(name)
     assert len({shape.name for shape in shapes}) == len(shapes)
@@ -286,6 +284,16 @@ def test_in_a_bundled_split_each_design_is_on_one_side_and_each_shape_is_free(na
     free = ("GPL-2.0-or-later",) if name == "planes" else ("CC0", "CC-BY")
     assert all(shape.licence.startswith(free) and shape.creator for shape in shapes)
     assert not any("NC" in shape.licence or "ND" in shape.licence for shape in shapes)
+
+
+def test_of_parked_planes_none_is_of_a_held_out_design_and_what_is_left_out_says_why() -> None:
+    """They are learnt beside the split `planes`, which holds designs out."""
+    planes, parked = read_split("planes"), read_split("parked-planes")
+    learnt = [shape for shape in parked if shape.split == "train"]
+    assert {shape.split for shape in parked} == {"train", "out"}
+    assert not {shape.design for shape in learnt} & {shape.design for shape in planes if shape.split == "test"}
+    assert not {shape.name for shape in learnt} & {shape.name for shape in planes}
+    assert all(bool(shape.note) == (shape.split == "out") for shape in parked)
 
 
 def test_the_sofas_are_sixteen_to_train_on_and_at_least_five_held_out() -> None:

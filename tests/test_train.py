@@ -20,7 +20,7 @@ from torch import Tensor
 
 import distrace.cli.train
 from distrace.checkpoint import Model, load_model, save_experiment, save_model
-from distrace.cli import main
+from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
 from distrace.decoder import NetworkSpecs
 from distrace.files import alone
@@ -474,3 +474,17 @@ def test_a_training_that_diverges_keeps_what_was_saved_before(tmp_path: Path, ru
         run("train", samples, "--out", out, "--steps", "9")
     assert "the training has diverged at step 4" in " ".join(capsys.readouterr().err.split())
     assert_same_state(before["decoder"], checkpoint(out)["decoder"])
+
+
+def test_what_is_learnt_of_several_splits_is_what_any_of_them_trains_on(tmp_path: Path) -> None:
+    columns = "name,split,design,turn,path,creator,licence"
+    for name, rows in (("jets", ("a,train", "b,test")), ("parked", ("c,train", "d,out"))):
+        lines = [f"{row},{row[0]},0,{row[0]}.ply,me,CC0-1.0" for row in rows]
+        (tmp_path / f"{name}.csv").write_text("\n".join([columns, *lines]))
+    samples = tmp_path / "samples"
+    samples.mkdir()
+    for name in ("a", "a~warped1", "b", "c", "d", "e"):
+        (samples / f"{name}.npz").touch()
+    splits = [str(tmp_path / f"{name}.csv") for name in ("jets", "parked")]
+    assert [path.stem for path in train_samples.sample_files(samples, tmp_path, splits)] == ["a", "a~warped1", "c"]
+    assert len(train_samples.sample_files(samples, tmp_path)) == 6

@@ -38,7 +38,7 @@ class Complete:
     starts: int = FitConfig.starts
     plausible: int = 0  # so many other completions that fit, too, and how far they are apart
     seed: int = 0
-    resolution: int = 128  # of the mesh: wings and rods that are thinner than its cells, a 64th, are torn; 256 keeps them
+    resolution: int = 128  # of the mesh: wings and rods thinner than its cells, a 64th, are torn; 256 keeps them
     device: str = "cpu"
 
     def run(self) -> None:

@@ -22,20 +22,22 @@ from distrace.files import written
 from distrace.shading import in_rows, save_png
 
 PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
+PREPARED = {"furniture": furniture.prepare, "planes": planes.prepare, "parked-planes": planes.prepare_parked}
 
 
 @dataclass(frozen=True)
 class Data:
     """Fetch a source of meshes, unpack it, and list every mesh with its creator and licence."""
 
-    name: tyro.conf.Positional[Literal["furniture", "planes"]]
-    """furniture: Debian's sweethome3d-furniture; planes: the aircraft of its flightgear-data-ai"""
-    out: Path | None = None  # by default out/furniture or out/planes
+    name: tyro.conf.Positional[Literal["furniture", "planes", "parked-planes"]]
+    """furniture: Debian's sweethome3d-furniture; planes: the aircraft of its flightgear-data-ai; parked-planes: those
+    at the airports of its flightgear-data-base, of 1.3 GB"""
+    out: Path | None = None  # by default out/furniture and so on
     source: Annotated[Path | None, tyro.conf.arg(name="from")] = None  # the .deb, where apt-get is not at hand
 
     def run(self) -> None:
         run = start(self.out or Path("out") / self.name)
-        meshes = (furniture if self.name == "furniture" else planes).prepare(run.out, self.source)
+        meshes = PREPARED[self.name](run.out, self.source)
         console.print(summary(meshes), markup=False)
         if self.name == "furniture":
             console.print(f"{furniture.left_out(run.out)} models in other formats are left out")

@@ -1,6 +1,7 @@
 """What `train` learns from: files of samples, or meshes that are sampled first."""
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from distrace.cli.data import sampled
@@ -10,13 +11,14 @@ from distrace.data.split import every_mesh, has_meshes, on_side
 MESH_SAMPLES = 200_000  # of each mesh
 
 
-def sample_files(given: Path, out: Path, split: str | None) -> list[Path]:
-    """Files of a folder of samples, those of a split if one is named; of a folder of meshes, sampled below `out`."""
+def sample_files(given: Path, out: Path, splits: Sequence[str] = ()) -> list[Path]:
+    """Files of a folder of samples, those of splits if any is named; of a folder of meshes, sampled below `out`."""
     has_samples = any(given.glob("*.npz")) or not has_meshes(given)
     folder = given if has_samples else _sampled_meshes(given, out / "samples")
     paths = sorted(folder.glob("*.npz"))
-    if split:
-        wanted = {split, *(shape.name for shape in on_side("train", split))}  # what was invented is called sofas~1
+    if splits:
+        learnt = {shape.name for split in splits for shape in on_side("train", split)}
+        wanted = learnt.union(splits)  # what was invented is called sofas~1
         paths = [path for path in paths if path.stem.split("~")[0] in wanted]
     if not paths:
         what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"

@@ -6,10 +6,10 @@ import stat
 import sys
 import tarfile
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path, PureWindowsPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, BinaryIO
 
 from ..errors import explained
@@ -26,17 +26,18 @@ class _Member:
     open: Callable[[], IO[bytes] | None]
 
 
-def unpack_deb(path: Path, folder: Path, limit: int = LIMIT) -> None:
-    """The files of a Debian package, written under `folder`.
+def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str] = ()) -> None:
+    """The files of a Debian package, or those `below` some of its folders, written under `folder`.
 
-    Raises ValueError if `path` is not a whole .deb, or if a member is neither file nor folder, would land
+    Raises ValueError if `path` is not a whole .deb, or if one of them is neither file nor folder, would land
     outside `folder`, or brings the total above `limit` bytes; what was written before that stays.
     """
     with explained(f"{path} cannot be unpacked as a Debian package; download the .deb again"):
         with _not_empty(path) as handle:
             packed = _data_tar(handle, path.stat().st_size)
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
-            _write(_tar_members(archive), folder, limit)
+            wanted = (each for each in _tar_members(archive) if not below or _is_below(each.name, below))
+            _write(wanted, folder, limit)
             _read_to_the_end(archive)
 
 
@@ -81,6 +82,10 @@ def _tar_members(archive: tarfile.TarFile) -> Iterator[_Member]:
     for entry in archive:
         content = partial(archive.extractfile, entry)
         yield _Member(entry.name, entry.size, entry.isfile(), entry.isdir(), content)
+
+
+def _is_below(name: str, folders: Sequence[str]) -> bool:
+    return any(PurePosixPath(name).is_relative_to(folder) for folder in folders)
 
 
 def _read_to_the_end(archive: tarfile.TarFile) -> None:

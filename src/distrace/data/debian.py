@@ -10,6 +10,7 @@ from ..errors import explained
 from .archive import unpack_deb
 
 _STAMP = "unpacked-from.txt"
+DOCUMENTS = "usr/share/doc"
 
 
 def by_hand(package: str) -> str:
@@ -38,7 +39,14 @@ def _download(package: str, folder: Path) -> Path:
     return found[0]
 
 
-def unpacked(package: str, deb: Path, folder: Path, arrange: Callable[[Path, Path], None], keeping: str = "") -> Path:
+def unpacked(
+    package: str,
+    deb: Path,
+    folder: Path,
+    arrange: Callable[[Path, Path], None],
+    keeping: str = "",
+    below: str = "",  # the folder of the package that `arrange` needs, if not all
+) -> Path:
     """The package's folder under `folder`: what `arrange` takes there from the files of the .deb, and `copyright`.
 
     A second call unpacks nothing: a stamp, written last, names the .deb and what was kept of it. Raises ValueError if
@@ -55,9 +63,9 @@ def unpacked(package: str, deb: Path, folder: Path, arrange: Callable[[Path, Pat
     partial = folder / f".{package}.partial"
     shutil.rmtree(partial, ignore_errors=True)
     content = partial / "package"
-    unpack_deb(deb, content)
+    unpack_deb(deb, content, below=(below, DOCUMENTS) if below else ())
     arrange(content, partial)
-    for licences in content.glob("usr/share/doc/*/copyright"):
+    for licences in content.glob(f"{DOCUMENTS}/*/copyright"):
         licences.replace(partial / "copyright")
     shutil.rmtree(content)
     (partial / _STAMP).write_text(source)

@@ -1,7 +1,11 @@
-"""A catalogue of aircraft meshes: Debian's package `flightgear-data-ai`, in AC3D, under the GPL."""
+"""Catalogues of aircraft meshes, from Debian's packages of FlightGear, in AC3D, under the GPL.
+
+Those that fly by themselves, in `flightgear-data-ai`, and those parked at its airports, in `flightgear-data-base`.
+"""
 
 import re
 import shutil
+from functools import partial
 from pathlib import Path
 
 from .catalogue import Mesh, listed
@@ -12,6 +16,9 @@ AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
 LICENCE, CREATOR = "GPL-2.0-or-later", "FlightGear team"
 PARTS = {"light", "lights", "Lights", "refueling"}  # folders
 NO_PLANES = {"Ferry", "SpaceShuttle", "balloon"}
+
+PARKED_PACKAGE = "flightgear-data-base"
+PARKED = "usr/share/games/flightgear/Scenery/Models/Aircraft"
 
 _TEXTURE = re.compile(r'^texture\s+"(?:[^"\n]*[/\\])?([^"\n]+)"', re.MULTILINE)
 
@@ -26,20 +33,37 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    home = unpacked(PACKAGE, deb, folder, _arrange, keeping="meshes and images")
+    home = unpacked(PACKAGE, deb, folder, partial(_arrange, AIRCRAFT), keeping="meshes and images")
     meshes = [_mesh(aircraft, folder) for aircraft in sorted(home.iterdir()) if _models(aircraft)]
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
     return meshes
 
 
-def _arrange(content: Path, home: Path) -> None:
-    """Meshes, each with the images that it names beside it; sounds and flight plans are left behind."""
-    root = content / AIRCRAFT
+def prepare_parked(out: Path, deb: Path | None = None) -> list[Mesh]:
+    """The meshes of parked aircraft, and of what stands among them, by `catalogue.listed`."""
+    return listed(PARKED_PACKAGE, parked, out, deb)
+
+
+def parked(deb: Path, folder: Path) -> list[Mesh]:
+    """Each mesh by its file's name, helicopters, trailers and liveries among them: the split says what is learnt.
+
+    Raises ValueError if `deb` is missing, broken, or another package.
+    """
+    home = unpacked(PARKED_PACKAGE, deb, folder, partial(_arrange, PARKED), "parked aircraft", PARKED)
+    paths = [path.relative_to(folder) for path in sorted(home.glob("*.ac"))]
+    if not paths:
+        raise ValueError(f"{deb} holds no aircraft ({PARKED}/*.ac); {by_hand(PARKED_PACKAGE)}")
+    return [Mesh("parked", path.stem, CREATOR, LICENCE, PARKED_PACKAGE, path) for path in paths]
+
+
+def _arrange(folder: str, content: Path, home: Path) -> None:
+    """The folder's meshes, each with the images that it names beside it; sounds and flight plans are left behind."""
+    root = content / folder
     for path in sorted(root.rglob("*.ac")):
         target = home / path.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
-        for image in _images(path, root / path.relative_to(root).parts[0]):
+        for image in _images(path, root.joinpath(*path.parent.relative_to(root).parts[:1])):
             shutil.copy(image, target.parent)
         shutil.move(path, target)
 
