@@ -150,5 +150,5 @@ def test_what_leans_backwards_has_its_top_behind() -> None:
 def test_a_split_is_learnt_with_what_was_invented_of_it(tmp_path: Path) -> None:
     for name in ("armchair-cc0", "armchair-cc0~warped1", "cafe-chair", "chairs~1", "sofas~1"):
         (tmp_path / f"{name}.npz").touch()
-    names = [path.stem for path in sample_files(tmp_path, tmp_path, "chairs")]
+    names = [path.stem for path in sample_files(tmp_path, tmp_path, ["chairs"])]
     assert names == ["armchair-cc0", "armchair-cc0~warped1", "chairs~1"]  # cafe-chair is held out
