@@ -294,6 +294,8 @@ def test_of_parked_planes_none_is_of_a_held_out_design_and_what_is_left_out_says
     assert not {shape.design for shape in learnt} & {shape.design for shape in planes if shape.split == "test"}
     assert not {shape.name for shape in learnt} & {shape.name for shape in planes}
     assert all(bool(shape.note) == (shape.split == "out") for shape in parked)
+    assert {shape.licence for shape in parked} == {"GPL-2.0-or-later"}
+    assert len({shape.path for shape in parked}) == len(parked)
 
 
 def test_the_sofas_are_sixteen_to_train_on_and_at_least_five_held_out() -> None:
