@@ -33,7 +33,7 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    home = unpacked(PACKAGE, deb, folder, partial(_arrange, AIRCRAFT), keeping="meshes and images")
+    home = unpacked(PACKAGE, deb, folder, partial(_arrange, AIRCRAFT), "meshes and images", AIRCRAFT)
     meshes = [_mesh(aircraft, folder) for aircraft in sorted(home.iterdir()) if _models(aircraft)]
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
