@@ -170,4 +170,5 @@ def test_the_page_shows_table_pictures_and_apart_from_them_the_published_one(pla
     assert text.count("<img") == 1
     assert "not comparable" in text
     assert "b, " in text
+    assert "averaged over columns" not in text, "without DeepSDF there is nothing to average"
     assert AXES["noise"] == "noise"

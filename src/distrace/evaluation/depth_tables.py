@@ -94,10 +94,9 @@ def depth_page(name: str, results: Sequence[Done], place: Place) -> str:
         f"{category}: " + ", ".join(f"{method} {ratio:.2f}" for method, ratio in methods.items())
         for category, methods in ratios(rows, axis).items()
     ]
+    against = [paragraph("Of DeepSDF's, averaged over columns: " + "; ".join(mean_ratios))] if mean_ratios else []
     parts = [
-        section(
-            "Table", table(header, cells), paragraph("Of DeepSDF's, averaged over columns: " + "; ".join(mean_ratios))
-        ),
+        section("Table", table(header, cells), *against),
         *(_curves(category, rows, axis) for category in dict.fromkeys(str(row["class"]) for row in rows)),
         *_instances(results, place),
     ]
