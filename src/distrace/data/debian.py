@@ -45,7 +45,7 @@ def unpacked(
     folder: Path,
     arrange: Callable[[Path, Path], None],
     keeping: str = "",
-    below: str = "",  # the folder of the package that `arrange` needs, if not all
+    below: str = "",  # the only folder of the package that is unpacked, for `arrange`
 ) -> Path:
     """The package's folder under `folder`: what `arrange` takes there from the files of the .deb, and `copyright`.
 
@@ -64,7 +64,7 @@ def unpacked(
     shutil.rmtree(partial, ignore_errors=True)
     content = partial / "package"
     unpack_deb(deb, content, below=(below, DOCUMENTS) if below else ())
-    arrange(content, partial)
+    arrange(content / below, partial)
     for licences in content.glob(f"{DOCUMENTS}/*/copyright"):
         licences.replace(partial / "copyright")
     shutil.rmtree(content)

@@ -5,7 +5,6 @@ Those that fly by themselves, in `flightgear-data-ai`, and those parked at its a
 
 import re
 import shutil
-from functools import partial
 from pathlib import Path
 
 from .catalogue import Mesh, listed
@@ -33,7 +32,7 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    home = unpacked(PACKAGE, deb, folder, partial(_arrange, AIRCRAFT), "meshes and images", AIRCRAFT)
+    home = unpacked(PACKAGE, deb, folder, _arrange, "meshes and images", AIRCRAFT)
     meshes = [_mesh(aircraft, folder) for aircraft in sorted(home.iterdir()) if _models(aircraft)]
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
@@ -50,16 +49,15 @@ def parked(deb: Path, folder: Path) -> list[Mesh]:
 
     Raises ValueError if `deb` is missing, broken, or another package.
     """
-    home = unpacked(PARKED_PACKAGE, deb, folder, partial(_arrange, PARKED), "parked aircraft", PARKED)
+    home = unpacked(PARKED_PACKAGE, deb, folder, _arrange, "parked aircraft", PARKED)
     paths = [path.relative_to(folder) for path in sorted(home.glob("*.ac"))]
     if not paths:
         raise ValueError(f"{deb} holds no aircraft ({PARKED}/*.ac); {by_hand(PARKED_PACKAGE)}")
     return [Mesh("parked", path.stem, CREATOR, LICENCE, PARKED_PACKAGE, path) for path in paths]
 
 
-def _arrange(folder: str, content: Path, home: Path) -> None:
-    """The folder's meshes, each with the images that it names beside it; sounds and flight plans are left behind."""
-    root = content / folder
+def _arrange(root: Path, home: Path) -> None:
+    """The meshes of `root`, each with the images that it names beside it; sounds and flight plans are left behind."""
     for path in sorted(root.rglob("*.ac")):
         target = home / path.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
