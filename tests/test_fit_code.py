@@ -189,6 +189,20 @@ def test_the_best_end_is_brought_to_the_outline() -> None:
     assert after < 0.2 * before, "pixels that are wrong"
 
 
+def test_several_ends_are_brought_to_the_outline_where_depths_are_few(decoder: Decoder, view: View) -> None:
+    config = replace(CONFIG, iterations=3, starts=3, trial=1, more=1, hops=1, doubtful=-1.0)
+    few = view.sparse(50)
+    one, several = (list(fit_code(decoder, [few], PRIOR, replace(config, sharpened=k))) for k in (1, 3))
+    ends = {step.start: step.verdict for step in one if isfinite(step.verdict) and step.iteration == 3}
+    assert set(ends) == set(range(5)), "every start's end is judged where it ends, hops' too"
+    outlined = [step.start for step in several if "outline" in step.terms and not isfinite(step.verdict)]
+    assert list(dict.fromkeys(outlined)) == sorted(ends, key=lambda start: ends[start])[:3]
+    assert several[-1].verdict == min(step.verdict for step in several) <= one[-1].verdict
+    assert len(several) == len(one) + 2 * config.sharpening <= replace(config, sharpened=3).total
+    dense = [step.start for step in fit_code(decoder, [view], PRIOR, config) if "outline" in step.terms]
+    assert len(set(dense)) == 1, "many depths tell which end is best"
+
+
 def test_without_a_mask_the_depths_tell(decoder: Decoder, view: View) -> None:
     step = last(fit_code(decoder, [replace(view, mask=None)], PRIOR, CONFIG))
     assert error(decoder, step.code) < 2e-3
@@ -275,7 +289,7 @@ def test_the_solver_lowers_its_loss(decoder: Decoder, view: View) -> None:
 def test_no_view_and_nonsense_are_refused(decoder: Decoder) -> None:
     with pytest.raises(ValueError, match="no view was given"):
         next(fit_code(decoder, [], PRIOR))
-    for wrong in ({"iterations": 0}, {"starts": -1}, {"stages": 0}, {"sharpening": -2}):
+    for wrong in ({"iterations": 0}, {"starts": -1}, {"stages": 0}, {"sharpened": 0}, {"sharpening": -2}):
         with pytest.raises(ValueError, match=f"{next(iter(wrong.values()))}.*at least 1"):
             CodeFitConfig(**wrong)
 

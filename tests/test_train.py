@@ -210,16 +210,17 @@ def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> 
     save_model(tmp_path / "bundled", model := load_model(tmp_path / "trained"))  # without weight norm
     points = samples.outside[0][:50, :3]
     for name in ("trained", "bundled"):
-        second = start(3, SPECS, CONFIG, CPU)
-        begin_with(second, ["sphere1", "new", "sphere0"], load_model(tmp_path / name))
+        second = start(4, SPECS, CONFIG, CPU)
+        begin_with(second, ["sphere1", "new", "sphere0", "sphere0~warped1"], load_model(tmp_path / name))
         assert_close = torch.testing.assert_close
         assert_close(second.codes[[2, 0]].detach(), model.codes, rtol=1e-3, atol=1e-3)
         assert_close(second.codes[1].detach(), model.codes.mean(0), rtol=1e-3, atol=1e-3)
+        assert torch.equal(second.codes[3], second.codes[2]), "a variant's is its original's"
         with torch.no_grad():
             values = second.decoder.eval().field(model.codes[0])(points)
             assert_close(values, model.field(0)(points), rtol=1e-2, atol=1e-3)
         before = second.decoder.lin0.parametrizations.weight.original1.clone()
-        next(train(spheres(0.3, 0.4, 0.6), second, replace(CONFIG, warm_up=1)))
+        next(train(spheres(0.3, 0.4, 0.6, 0.7), second, replace(CONFIG, warm_up=1)))
         assert not torch.equal(before, second.decoder.lin0.parametrizations.weight.original1), "the optimiser has it"
 
 

@@ -23,6 +23,7 @@ from distrace.field import SDF
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
+VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
 
 
 @dataclass(frozen=True)
@@ -50,9 +51,9 @@ class Model:
         return self.codes[self.shapes.index(shape)]
 
     def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
-        """By name; of shapes that it was not trained on, the mean code."""
+        """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
         known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
-        return torch.stack([known.get(shape, mean) for shape in shapes])
+        return torch.stack([known.get(shape, known.get(shape.split(VARIANT)[0], mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)

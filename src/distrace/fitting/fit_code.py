@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import chain
 from math import isfinite
 
 import torch
@@ -22,7 +23,7 @@ from distrace.fitting.seen import Seen
 from distrace.fitting.side_by_side import Fields, Groups
 from distrace.fitting.solver import SolverConfig
 from distrace.fitting.staged import CodeFitConfig, ProblemOf, solved, stage_of
-from distrace.fitting.starts import Step, best_of, by_last_loss, decided, ended, passed
+from distrace.fitting.starts import Step, best_of, by_last_loss, decided, ended
 from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradiction
 from distrace.prior import Prior
@@ -33,7 +34,7 @@ Verdict = Callable[[SDF, Step], float]
 def fit_code(
     decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
 ) -> Iterator[Step]:
-    """Fits a code to views, from several starts; the end that contradicts the views least is taken to their outlines.
+    """Fits a code to views, from several starts; the ends that contradict the views least are taken to their outlines.
 
     The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
@@ -54,25 +55,38 @@ def fit_code(
         return contradiction(sdf, others, config.compared.trace)
 
     random = torch.Generator().manual_seed(config.seed)
-    steps = _best(fields, prior, Hints.of(seen(random, DEPTHS, SILHOUETTE), random), problem, config, verdict)
+    hints = Hints.of(seen(random, DEPTHS, SILHOUETTE), random)
+    few = hints.depths < DEPTHS  # they do not tell which training shapes are near, nor which of several ends is best
+    config = config if few else replace(config, hops=0, sharpened=1)
+    steps = _best(fields, prior, hints, problem, config, verdict)
     if not config.sharpening or not any(len(pool.between) for pool in pools):
         return steps
     random = torch.Generator().manual_seed(config.seed + 2)
     sharp = seen(random, config.depth_rays, config.mask_rays // 2, config.outline_rays)
-    return _then_sharpened(steps, Problem(fields, prior, sharp, config.compared), config, verdict)
+    return _then_sharpened(steps, Problem(fields, prior, sharp, config.compared, config.outlying), config, verdict)
 
 
 def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Verdict) -> Iterator[Step]:
-    """Steps, and from where they end others that bring the surface to the outline itself; the better end comes last.
+    """Steps, and from the best of their ends others that bring the surface to the outline; the best end comes last.
 
     From farther away such rays, which pull from both sides, lead to other ends more often than they help.
     """
-    best = yield from passed(steps)
-    step, problem.scale, w = best, config.outlying, problem.prior.coordinates(best.code)
-    solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
-    for step, _ in stage_of(problem, w, None, solver, best.start, best.iteration):
+    ends: dict[int, Step] = {}
+    for step in steps:
         yield step
-    yield decided([_judged(problem.fields, verdict, end) for end in (best, step)])
+        if isfinite(step.verdict):
+            ends[step.start] = step
+    best = sorted(ends.values(), key=lambda end: end.verdict)[: config.sharpened]
+    sharper = problem.fields.side_by_side([_sharpened(end, replace(problem), config) for end in best])
+    yield from chain.from_iterable(sharper)
+    last = [*best, *(fit[-1] for fit in sharper)]
+    yield decided([_judged(problem.fields, verdict, end) for end in last])
+
+
+def _sharpened(end: Step, problem: Problem, config: CodeFitConfig) -> Iterator[Step]:
+    solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
+    steps = stage_of(problem, problem.prior.coordinates(end.code), None, solver, end.start, end.iteration)
+    return (step for step, _ in steps)
 
 
 def fit_points(
@@ -114,8 +128,8 @@ def _best(
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best.
 
-    Where depths are too few to tell which training shapes are near, it hops from the best end and looks at other rays
-    (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
+    While none fits it hops from the best one and looks at other rays (basin hopping: Wales and Doye,
+    *J. Phys. Chem. A* 1997).
     """
     first, judge = first_of(fields.quick, prior, hints, config.apart, config.seed), partial(_judged, fields, verdict)
 
@@ -125,11 +139,10 @@ def _best(
     def hop(start: int, best: Step) -> Iterator[Step]:
         other = replace(config, seed=config.seed + start)
         away = prior.draw(torch.Generator().manual_seed(other.seed), config.hop)
-        return solved(problem_of, prior, other, start, prior.coordinates(best.code) + away)
+        return ended(solved(problem_of, prior, other, start, prior.coordinates(best.code) + away), judge)
 
     groups = Groups(fields, fit, [range(config.starts), range(config.starts, config.apart)])
-    starts = config if hints.depths < DEPTHS else replace(config, hops=0)
-    steps = ended(best_of(starts, groups.steps, by_last_loss, judge, hop), groups.charge)
+    steps = ended(best_of(config, groups.steps, by_last_loss, judge, hop), groups.charge)
     step = next(steps)
     yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
     yield from steps

@@ -36,7 +36,8 @@ class CodeFitConfig(Starts):
     depth_rays: int = 1000  # of each view
     mask_rays: int = 900  # few would be fitted for themselves: a code has 256 coordinates
     first_share: float = 0.3  # of them, in the first stage: while all is coarse
-    sharpening: int = 6  # steps at the end, from the best one, in which …
+    sharpened: int = 3  # ends, where depths are few, otherwise the best one: from each of them …
+    sharpening: int = 6  # … so many steps more, in which …
     outline_rays: int = 600  # … so many rays are to touch the surface
     compared: Comparison = Comparison(Weights(mask=30.0, code=0.05))  # both more than Adam's: docs/from_the_paper.md
     scale: float = 0.02  # at first: what is far off is no outlier …
@@ -47,14 +48,14 @@ class CodeFitConfig(Starts):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.stages < 1 or self.sharpening < 0:
-            given = f"{self.stages} stages and {self.sharpening} steps of sharpening"
-            raise ValueError(f"{given} were asked for; there must be at least 1 stage")
+        if min(self.stages, self.sharpened) < 1 or self.sharpening < 0:
+            given = f"{self.stages} stages and {self.sharpening} steps of sharpening from {self.sharpened} ends"
+            raise ValueError(f"{given} were asked for; there must be at least 1 stage and 1 end")
 
     @property
     def total(self) -> int:
         """Steps at most: where no silhouette is known it is not sharpened."""
-        return super().total + (self.sharpening + 1 if self.sharpening else 0)
+        return super().total + (self.sharpening * min(self.sharpened, self.most) + 1 if self.sharpening else 0)
 
     def scale_and_kernel(self, stage: int) -> tuple[float, Kernel]:
         """A stage's scale, and how what is beyond it counts."""

@@ -9,9 +9,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from distrace.checkpoint import VARIANT
 from distrace.errors import explained
-
-VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
 
 Batch = tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]
 """Numbers of shapes, and samples of each: as many outside as inside."""

@@ -56,7 +56,7 @@ def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.d
 
 @torch.no_grad()
 def begin_with(training: Training, names: list[str], model: Model) -> None:
-    """Takes over a model's network, and its codes of shapes of the same names; the other shapes begin at their mean."""
+    """Takes over a model's network, and its codes of shapes of the same names; others begin as `codes_of` tells."""
     for layer in range(training.decoder.depth):
         own, learnt = (getattr(decoder, f"lin{layer}") for decoder in (training.decoder, model.decoder))
         if is_parametrized(own, "weight"):

@@ -6,8 +6,8 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from distrace.checkpoint import Model
-from distrace.training.batches import VARIANT, Samples
+from distrace.checkpoint import VARIANT, Model
+from distrace.training.batches import Samples
 
 REACH = 0.02  # a sample so near to one whose sign is wrong counts as well, on whichever side of the surface
 CERTAIN = 0.002  # the sign of a sample nearer to the surface says little
