@@ -200,7 +200,7 @@ def test_several_ends_are_brought_to_the_outline_where_depths_are_few(decoder: D
     assert several[-1].verdict == min(step.verdict for step in several) <= one[-1].verdict
     assert len(several) == len(one) + 2 * config.sharpening <= replace(config, sharpened=3).total
     dense = [step.start for step in fit_code(decoder, [view], PRIOR, config) if "outline" in step.terms]
-    assert len(set(dense)) == 1, "many depths tell which end is best"
+    assert len(set(dense)) == 1, "of many depths the best one"
 
 
 def test_without_a_mask_the_depths_tell(decoder: Decoder, view: View) -> None:

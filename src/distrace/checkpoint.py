@@ -53,10 +53,15 @@ class Model:
     def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
         """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
         known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
-        return torch.stack([known.get(shape, known.get(shape.split(VARIANT)[0], mean)) for shape in shapes])
+        return torch.stack([known.get(shape, known.get(original(shape), mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
+
+
+def original(shape: str) -> str:
+    """The name of what a variant was made of; of other shapes their own."""
+    return shape.split(VARIANT)[0]
 
 
 def bundled_models() -> list[str]:

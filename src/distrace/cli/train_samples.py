@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from distrace.checkpoint import VARIANT
+from distrace.checkpoint import original
 from distrace.cli.data import sampled
 from distrace.data import sampling
 from distrace.data.split import every_mesh, has_meshes, on_side
@@ -20,7 +20,7 @@ def sample_files(given: Path, out: Path, splits: Sequence[str] = ()) -> list[Pat
     if splits:
         learnt = {shape.name for split in splits for shape in on_side("train", split)}
         wanted = learnt.union(splits)  # what was invented is called sofas~1
-        paths = [path for path in paths if path.stem.split(VARIANT)[0] in wanted]
+        paths = [path for path in paths if original(path.stem) in wanted]
     if not paths:
         what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"
         raise ValueError(f"{folder} {what}; `distrace sample` makes them")

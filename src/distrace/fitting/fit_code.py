@@ -56,7 +56,7 @@ def fit_code(
 
     random = torch.Generator().manual_seed(config.seed)
     hints = Hints.of(seen(random, DEPTHS, SILHOUETTE), random)
-    few = hints.depths < DEPTHS  # they do not tell which training shapes are near, nor which of several ends is best
+    few = hints.depths < DEPTHS  # they hardly tell which training shapes are near
     config = config if few else replace(config, hops=0, sharpened=1)
     steps = _best(fields, prior, hints, problem, config, verdict)
     if not config.sharpening or not any(len(pool.between) for pool in pools):
@@ -77,6 +77,7 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
         if isfinite(step.verdict):
             ends[step.start] = step
     best = sorted(ends.values(), key=lambda end: end.verdict)[: config.sharpened]
+    # each with a problem of its own: it counts its own evaluations
     sharper = problem.fields.side_by_side([_sharpened(end, replace(problem), config) for end in best])
     yield from chain.from_iterable(sharper)
     last = [*best, *(fit[-1] for fit in sharper)]
