@@ -26,6 +26,7 @@ from distrace.cli import evaluate_depth, show
 from distrace.data.samples import write_samples
 from distrace.data.view import View, load_view, save_view
 from distrace.evaluation import evaluate, sparse_depth, spread_table, training_choices
+from distrace.evaluation.analytic import NAMES
 from distrace.mesh import MeshConfig
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
@@ -451,6 +452,30 @@ def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None
     assert facts["evaluations"] == sum(row["queries"] for row in facts["rows"])
 
 
+def test_bench_views_writes_rows_a_summary_and_the_worst_views(model: Path, run: Command, tmp_path: Path) -> None:
+    words = ("bench", "views", model, "--views", 3, "--sizes", 16, 24, "--seed", 5)
+    run(*words, "--out", tmp_path / "first")
+    assert names(tmp_path / "first") == {"result.json", "worst.png", "index.html"}
+    facts = result(tmp_path / "first", "rows", "summary", "command", "machine", "evaluations", "setup_evaluations")
+    columns = {"model", "code", "camera", "pixels", "missed", "added", "iou", "largest_loss", "off", "evaluations"}
+    assert all(columns | {"per_pixel", "exhausted", "seconds", "fails"} <= set(row) for row in facts["rows"])
+    camera = {"azimuth", "elevation", "distance", "focal_mm", "target", "size"}
+    assert all(set(row["camera"]) == camera and 16 <= row["camera"]["size"] <= 24 for row in facts["rows"])
+    assert set(facts["rows"][2]["code"]) == {"first", "second", "share"}
+    assert facts["evaluations"] == sum(row["evaluations"] for row in facts["rows"])
+    assert [line["model"] for line in facts["summary"]] == [model.name]
+    run(*words, "--strategy", "dynamic", "--out", tmp_path / "second")
+    again = result(tmp_path / "second", "rows")
+    assert {row["strategy"] for row in again["rows"]} == {"dynamic"}
+    for key in ("code", "camera", "pixels"):
+        assert [row[key] for row in again["rows"]] == [row[key] for row in facts["rows"]], key
+
+
+def test_bench_views_measures_analytic_fields_alone_where_no_model_is_named(run: Command, tmp_path: Path) -> None:
+    run("bench", "views", "--fields", "--views", 1, "--sizes", 16, 16, "--out", tmp_path)
+    assert [row["model"] for row in result(tmp_path, "rows")["rows"]] == list(NAMES)
+
+
 def test_without_a_command_or_with_help_it_says_what_there_is(run: Command, capsys: pytest.CaptureFixture) -> None:
     with pytest.raises(SystemExit) as stopped:
         run("--help")
@@ -537,6 +562,13 @@ BAD = [
     ("mesh {model} --code 9", "code 9"),
     ("bench trace {model} --size 0", "0 × 0"),
     ("bench everything {model}", "trace"),
+    ("bench trace", "bench trace was given no model"),
+    ("bench memory {model} sofas", "2 models"),
+    ("bench views {model} {tmp}/missing", "neither a folder nor a bundled model"),
+    ("bench views {model} --views 0", "--views 0"),
+    ("bench views {model} --sizes 64 32", "--sizes 64 32"),
+    ("bench views {model} --strategy slow", "--strategy slow was given; choose one of parallel"),
+    ("bench views {model} --seed -1", "--seed -1"),
     ("bench trace {tmp}/missing", "neither a folder nor a bundled model"),
     ("complete {model} {tmp}/missing.npz", "missing.npz is not an observation"),
     ("complete {model} {tmp}/text", "text is not an observation"),

@@ -3,13 +3,14 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import torch
 import tyro
 
 from distrace.checkpoint import Model
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.bench_views import Plan, bench_views
+from distrace.cli.common import Flag, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
 from distrace.data.split import on_side
 from distrace.evaluation import ablation, backward, fields, gradients, growth, solvers, tables
@@ -31,24 +32,41 @@ SHORT: dict[str, str] = {
 class Bench:
     """Measure what tracing costs and how far it is off, against a reference that takes no chances."""
 
-    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients", "solvers"]]
+    what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients", "solvers", "views"]]
     """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
     with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels;
     gradients: exact and DIST's against finite differences, and the time of a backward pass; solvers: how fast Adam and
-    Levenberg–Marquardt complete the held-out shapes"""
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    Levenberg–Marquardt complete the held-out shapes; views: whether random views of models are right"""
+    models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]"), tyro.conf.Positional] = ()
+    """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, by default all
+    bundled ones"""
     out: Path = Path("out/bench")
     code: int = 0  # which training shape
     size: int = 512  # pixels along each side, of `trace`, `fields` and the times of `gradients`
     repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
     meshes: Path = Path("out/furniture")  # for `solvers`, as `distrace data furniture` makes it
     split: str = "sofas"  # whose held-out shapes `solvers` completes
+    views: int = 60  # of `views`: random views of each model, and a fifth as many of each family of fields
+    sizes: tuple[int, int] = (128, 512)  # of `views`: the smallest and the largest image, in pixels along each side
+    fields: Flag = False  # of `views`: analytic fields, too; without MODEL, these alone
+    strategy: str | None = None  # of `views`: as in `distrace render`; by default what `distrace.render` does unasked
+    seed: int = 0  # of `views`
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model = opened(self.model, run.device)
-        getattr(self, f"_{self.what}")(run, model)
+        if self.what == "views":
+            bench_views(run, Plan(self.models, self.fields, self.views, self.sizes, self.seed, self.strategy))
+        else:
+            getattr(self, f"_{self.what}")(run, opened(self.model, run.device))
+
+    @property
+    def model(self) -> str:
+        """The one model that all but `views` measure."""
+        if len(self.models) != 1:
+            given = f"{len(self.models)} models ({', '.join(self.models)})" if self.models else "no model"
+            raise ValueError(f"bench {self.what} was given {given}; name one, as in `distrace bench {self.what} sofas`")
+        return self.models[0]
 
     def _trace(self, run: Run, model: Model) -> None:
         camera, cases = poster_view(self.size).to(run.device), []

@@ -62,13 +62,15 @@ def poster_view(size: int = 512) -> Camera:
 
 @torch.no_grad()
 def reference_distance(sdf: SDF, rays: Rays, bounds: Bounds) -> Float[Tensor, "*batch"]:
-    """The first zero on each ray, `inf` without one.
+    """Returns the distance of the first surface on each ray, `inf` where there is none.
 
     A cautious march (half the value, at most 0.02) until the sign changes, then bisection to 1e-6. Steps are never
-    shorter than 5e-5, so that a ray on which f only comes close to zero ends.
+    shorter than 5e-5, so that a ray on which f only comes close to zero ends. A ray that starts in the solid sees
+    nothing, as for every strategy (`Outcome.INSIDE`).
     """
     rays, near, far = rays.flat(), bounds.near.reshape(-1), bounds.far.reshape(-1)
     low, high = near.clone(), torch.full_like(near, torch.inf)
+    outside = torch.full_like(near, -torch.inf)  # the last sample before the sign changes
     active = bounds.meets.reshape(-1).nonzero()[:, 0]
     while len(active):
         value = sdf(rays[active].at(low[active]))
@@ -76,20 +78,21 @@ def reference_distance(sdf: SDF, rays: Rays, bounds: Bounds) -> Float[Tensor, "*
         high[active[crossed]] = low[active[crossed]]
         active, value = active[~crossed], value[~crossed]
         last = low[active]
+        outside[active] = last
         low[active] = last + (0.5 * value).clamp(SMALLEST_STEP, 0.02)
         active = active[low[active] < far[active]]
-    return _bisected(sdf, rays, high).reshape(bounds.near.shape)
+    return _bisected(sdf, rays, outside, high).reshape(bounds.near.shape)
 
 
-def _bisected(sdf: SDF, rays: Rays, inside: Tensor) -> Tensor:
-    """The zero before the first sample inside, which lies at most 0.02 before it."""
-    found = torch.isfinite(inside).nonzero()[:, 0]
-    high, low = inside[found], inside[found] - 0.02
+def _bisected(sdf: SDF, rays: Rays, outside: Float[Tensor, "n"], inside: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    """Returns the zero between two samples at most 0.02 apart; `inf` where one of them is not finite."""
+    found = (torch.isfinite(inside) & torch.isfinite(outside)).nonzero()[:, 0]
+    low, high = outside[found], inside[found]
     for _ in range(15):  # 0.02 / 2^15 < 1e-6
         middle = (low + high) / 2
         solid = sdf(rays[found].at(middle)) < 0
         low, high = torch.where(solid, low, middle), torch.where(solid, middle, high)
-    return inside.index_put((found,), (low + high) / 2)
+    return torch.full_like(inside, torch.inf).index_put((found,), (low + high) / 2)
 
 
 def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tensor, "height width"]:

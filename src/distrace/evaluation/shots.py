@@ -1,0 +1,125 @@
+"""Random codes and cameras: what a rendering is tried on.
+
+The object is neither always whole in the image nor always tiny: distance and focal length are drawn apart.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.checkpoint import Model
+from distrace.field import SDF, value_and_gradient
+
+SENSOR_MM = 32.0
+DISTANCES = (1.6, 12.0)  # of the eye from the origin, in radii
+FOCALS_MM = (18.0, 200.0)
+ELEVATIONS = (-30.0, 70.0)  # degrees
+TRIED, NEWTON = 256, 4  # points that a camera may aim at, and steps from the best of them to the surface
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A camera in the numbers that it was drawn by: angles in degrees, lengths in radii of the unit sphere."""
+
+    azimuth: float
+    elevation: float
+    distance: float  # of the eye from the origin
+    focal_mm: float  # with a sensor of 32 mm
+    target: tuple[float, float, float]  # the point in the middle of the image
+    size: int  # pixels along each side
+
+    def camera(self) -> Camera:
+        target = torch.tensor(self.target)
+        return Camera.look_at(
+            self.eye(), target, height=self.size, width=self.size, focal_mm=self.focal_mm, sensor_mm=SENSOR_MM
+        )
+
+    def eye(self) -> Float[Tensor, "3"]:
+        return Camera.orbit(self.azimuth, self.elevation, self.distance).T_world_camera[:3, 3]
+
+    def pixel(self, point: Float[Tensor, "3"]) -> float:
+        """The width in the world of what one pixel sees at a point in the middle of the image."""
+        return float((self.eye() - point).norm()) * SENSOR_MM / (self.focal_mm * self.size)
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A code between two training codes: (1 − share) · first + share · second."""
+
+    first: int
+    second: int
+    share: float
+
+
+@dataclass(frozen=True)
+class View:
+    """What is rendered: a field, by a camera; and a bound on the field's slope, by which the reference divides it."""
+
+    model: str
+    code: int | Mixture | None  # None for an analytic field
+    sdf: SDF
+    shot: Shot
+    steepest: float = 1.0
+    device: torch.device = torch.device("cpu")
+
+    def camera(self) -> Camera:
+        return self.shot.camera().to(self.device)
+
+
+def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> Iterator[View]:
+    """Draws codes and cameras; every third code lies between two training codes. The first views never depend on count.
+
+    Raises `ValueError` for sizes that no image has.
+    """
+    random = np.random.default_rng(seed)
+    for number in range(count):
+        code = _mixture(model, random) if number % 3 == 2 else int(random.integers(len(model.codes)))
+        field = model.field(_mixed(model, code) if isinstance(code, Mixture) else code)
+        shot = aimed(draw_shot(random, sizes), field, random, model.codes.device)
+        yield View(model.name, code, field, shot, device=model.codes.device)
+
+
+def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
+    """Draws a camera that looks at the origin. Distance and focal length are drawn apart, evenly in their logarithms.
+
+    Small images are more likely, by the cube of their size, so that each octave of sizes costs about the same.
+    Raises `ValueError` for sizes that no image has.
+    """
+    low, high = sizes
+    if not 1 <= low <= high:
+        raise ValueError(f"sizes from {low} to {high} pixels were given; give the smallest first, at least 1")
+    return Shot(
+        azimuth=float(random.uniform(0, 360)),
+        elevation=float(random.uniform(*ELEVATIONS)),
+        distance=float(np.exp(random.uniform(*np.log(DISTANCES)))),
+        focal_mm=float(np.exp(random.uniform(*np.log(FOCALS_MM)))),
+        target=(0.0, 0.0, 0.0),
+        size=round(float(random.uniform(high**-2, low**-2)) ** -0.5),
+    )
+
+
+@torch.no_grad()
+def aimed(shot: Shot, sdf: SDF, random: np.random.Generator, device: torch.device = torch.device("cpu")) -> Shot:
+    """The shot with its target moved to a random point near the surface, so that also a long lens sees some of it."""
+    points = torch.from_numpy(random.uniform(-0.6, 0.6, (TRIED, 3))).float().to(device)
+    point = points[sdf(points).abs().argmin()]
+    for _ in range(NEWTON):
+        value, gradient = value_and_gradient(sdf, point[None])
+        step = (value[:, None] * gradient / gradient.square().sum().clamp_min(1e-6))[0]
+        point = point - step * (0.2 / step.norm().clamp_min(1e-9)).clamp_max(1.0)
+    x, y, z = point.clamp(-0.9, 0.9).tolist()
+    return replace(shot, target=(x, y, z))
+
+
+def _mixture(model: Model, random: np.random.Generator) -> Mixture:
+    first, second = (int(number) for number in random.integers(len(model.codes), size=2))
+    return Mixture(first, second, float(random.uniform()))
+
+
+def _mixed(model: Model, mixture: Mixture) -> Float[Tensor, "length"]:
+    return torch.lerp(model.codes[mixture.first], model.codes[mixture.second], mixture.share)

@@ -1,0 +1,270 @@
+"""Random views: how they are drawn, what is counted in them, and the bars that they have to pass."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from distrace.camera import Camera
+from distrace.checkpoint import Model, load_model
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.evaluation import analytic, views
+from distrace.evaluation.bench import reference_depth, reference_distance
+from distrace.evaluation.shots import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
+from distrace.evaluation.views import ViewRow, badness, largest_part, measure_view, summaries
+from distrace.evaluation.views_page import agreement_page, described, pictures_of, worst_picture
+from distrace.primitives import box, difference, sphere, union
+from distrace.rays import Rays, meet_sphere
+from distrace.render import STRATEGIES, render
+from distrace.trace import DYNAMIC
+
+SIZES = (16, 32)
+SHOT = Shot(azimuth=20.0, elevation=10.0, distance=3.0, focal_mm=40.0, target=(0.0, 0.0, 0.0), size=64)
+CAUTIOUS = replace(DYNAMIC, steps=2000, tolerance=1e-6, step_scale=0.9)
+BALL = View("ball", None, sphere(0.5), SHOT)
+
+
+@pytest.fixture(scope="module")
+def small() -> Model:
+    """A decoder that was never trained."""
+    torch.manual_seed(0)
+    decoder = Decoder(NetworkSpecs(dims=(16, 16), code_length=4, latent_in=(), norm_layers=()))
+    return Model("small", decoder.requires_grad_(False), torch.randn(5, 4), tuple("abcde"))
+
+
+def test_the_first_views_do_not_depend_on_how_many_follow_and_a_seed_draws_others(small: Model) -> None:
+    def drawn(count: int, seed: int) -> list[tuple]:
+        return [(view.code, view.shot) for view in model_views(small, count, SIZES, seed)]
+
+    assert drawn(9, 3)[:4] == drawn(4, 3)
+    assert drawn(4, 3) != drawn(4, 4)
+
+
+def test_a_third_of_the_codes_are_mixtures_whose_field_is_that_of_the_code_between(small: Model) -> None:
+    all_views = list(model_views(small, 9, SIZES, 0))
+    mixed = [view for view in all_views if isinstance(view.code, Mixture)]
+    assert len(mixed) == 3
+    points = torch.rand(7, 3)
+    for view in mixed:
+        first, second = small.codes[view.code.first], small.codes[view.code.second]
+        between = first + view.code.share * (second - first)
+        torch.testing.assert_close(view.sdf(points), small.field(between)(points))
+    whole = next(view for view in all_views if isinstance(view.code, int))
+    torch.testing.assert_close(whole.sdf(points), small.field(whole.code)(points))
+
+
+def test_cameras_are_near_and_far_and_their_lenses_wide_and_long() -> None:
+    random = np.random.default_rng(0)
+    shots = [draw_shot(random, (128, 512)) for _ in range(400)]
+    assert all(128 <= shot.size <= 512 and -30 <= shot.elevation <= 70 for shot in shots)
+    for name, (low, high) in (("distance", DISTANCES), ("focal_mm", FOCALS_MM)):
+        values = [getattr(shot, name) for shot in shots]
+        assert low <= min(values) < 1.1 * low
+        assert high / 1.1 < max(values) <= high
+        assert np.median(values) == pytest.approx(math.sqrt(low * high), rel=0.2), "evenly in the logarithm"
+    quadrants = {int(shot.azimuth // 90) for shot in shots}
+    assert quadrants == {0, 1, 2, 3}
+    octaves = [sum(shot.size**2 for shot in shots if (shot.size > 256) == large) for large in (False, True)]
+    assert 0.5 < octaves[0] / octaves[1] < 2, "each octave of sizes costs about the same"
+
+
+def test_a_shot_stands_where_it_says_and_has_its_target_in_the_middle() -> None:
+    shot = replace(SHOT, target=(0.1, -0.2, 0.3))
+    camera = shot.camera()
+    orbit = Camera.orbit(shot.azimuth, shot.elevation, shot.distance)
+    torch.testing.assert_close(camera.T_world_camera[:3, 3], orbit.T_world_camera[:3, 3])
+    middle, depth = camera.project(torch.tensor(shot.target))
+    torch.testing.assert_close(middle, torch.tensor([32.0, 32.0]), atol=1e-3, rtol=0)
+    beside = torch.tensor(shot.target) + shot.pixel(torch.tensor(shot.target)) * camera.T_world_camera[:3, 0]
+    torch.testing.assert_close(camera.project(beside)[0], torch.tensor([33.0, 32.0]), atol=1e-3, rtol=0)
+    assert depth > 0
+
+
+def test_a_camera_aims_at_the_surface() -> None:
+    solid = box(torch.tensor([0.5, 0.02, 0.3]))
+    targets = [torch.tensor(aimed(SHOT, solid, np.random.default_rng(seed)).target) for seed in range(5)]
+    assert all(solid(target[None]).abs() < 1e-3 for target in targets)
+    assert len({tuple(target.tolist()) for target in targets}) == 5
+
+
+def wrong_by(monkeypatch: pytest.MonkeyPatch, shown, view: View = BALL) -> ViewRow:
+    """The row of a view where another field is rendered than the reference has."""
+    monkeypatch.setattr(views, "render", lambda sdf, camera: render(shown, camera, config=CAUTIOUS))
+    return measure_view(view).row
+
+
+def test_a_right_rendering_passes() -> None:
+    row = measure_view(BALL, "cautious", CAUTIOUS).row
+    assert (row.missed, row.added, row.iou, row.largest_loss, row.off, row.fails) == (0, 0, 1.0, 0, 0, ())
+    true = torch.isfinite(reference_depth(BALL.sdf, SHOT.camera()))
+    assert row.pixels == true.sum()
+    assert row.evaluations == row.per_pixel * row.pixels > row.pixels
+    assert row.strategy == "cautious"
+
+
+def test_what_is_lost_and_what_is_added_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    hidden = union(sphere(0.5), sphere(0.2, torch.tensor([0.0, 0.7, 0.0])))
+    more = wrong_by(monkeypatch, hidden)
+    less = wrong_by(monkeypatch, BALL.sdf, replace(BALL, sdf=hidden))
+    assert more.missed == less.added == 0
+    assert more.added == less.missed == less.largest_loss > 50
+    assert more.largest_loss == 0
+    assert more.iou == less.iou == pytest.approx(more.pixels / (more.pixels + more.added))
+    assert "connected loss" in less.fails
+    assert "connected loss" not in more.fails
+
+
+def test_depths_that_are_off_are_counted_where_both_see_something(monkeypatch: pytest.MonkeyPatch) -> None:
+    row = wrong_by(monkeypatch, sphere(0.498))
+    assert row.off == row.pixels - row.missed
+    assert "depth" in row.fails
+
+
+def test_a_steep_field_is_measured_against_the_same_reference() -> None:
+    steep = View("steep", None, lambda points: torch.tanh(20 * BALL.sdf(points)), SHOT, steepest=20.0)
+    truth = measure_view(steep, "dynamic", CAUTIOUS).truth
+    torch.testing.assert_close(truth, measure_view(BALL, "cautious", CAUTIOUS).truth, atol=1e-5, rtol=0)
+
+
+def test_parts_are_connected_by_corners_too() -> None:
+    mask = np.zeros((6, 6), dtype=bool)
+    assert largest_part(mask) == 0
+    mask[0, 0] = mask[1, 1] = mask[2, 2] = mask[5, 5] = True
+    assert largest_part(mask) == 3
+
+
+RIGHT = measure_view(BALL, "cautious", CAUTIOUS).row
+
+
+@pytest.mark.parametrize(
+    ("changes", "fails"),
+    [
+        (dict(pixels=10_000, iou=0.995, missed=8, largest_loss=8, off=2), ()),
+        (dict(pixels=10_000, iou=0.9949), ("IoU",)),
+        (dict(pixels=10_000, largest_loss=9), ("connected loss",)),
+        (dict(pixels=10_000, off=3), ("depth",)),
+        (dict(pixels=1_599, iou=0.5, missed=5, added=3, off=1), ()),
+        (dict(pixels=1_599, missed=5, added=4), ("wrong pixels",)),
+        (dict(pixels=1_600, missed=5, added=4), ()),
+        (dict(pixels=0, added=8), ()),
+        (dict(pixels=0, added=9), ("wrong pixels",)),
+        (dict(pixels=1_599, off=2), ("depth",)),
+    ],
+    ids=str,
+)
+def test_a_view_has_to_pass_each_bar(changes: dict, fails: tuple[str, ...]) -> None:
+    assert views._fails(replace(RIGHT, **changes)) == fails
+
+
+def test_a_summary_is_of_all_views_of_a_model() -> None:
+    lost = replace(RIGHT, iou=0.9, missed=20, largest_loss=12, off=3, fails=("IoU", "connected loss"))
+    other = replace(RIGHT, model="other")
+    first, second = summaries([RIGHT, lost, RIGHT, other])
+    assert (first.model, first.views, first.failing) == ("ball", 3, 1)
+    assert (first.worst_iou, first.median_iou, first.largest_loss) == (0.9, 1.0, 12)
+    assert first.off_per_5000 == pytest.approx(5000 * 3 / (3 * RIGHT.pixels - 20))
+    assert first.bar == "fails: IoU, connected loss"
+    assert (second.model, second.views, second.bar) == ("other", 1, "met")
+    (middling,) = summaries([replace(RIGHT, iou=0.999)])
+    assert middling.bar == "fails: median IoU"
+
+
+def test_a_ray_that_starts_in_the_solid_sees_nothing_and_one_in_a_hollow_sees_its_wall() -> None:
+    rays = Rays(torch.zeros(2, 3), torch.tensor([[0.0, 0, 1], [1, 0, 0]]))
+    assert (reference_distance(sphere(0.5), rays, meet_sphere(rays)) == torch.inf).all()
+    hollow = difference(sphere(0.7), sphere(0.5))
+    found = reference_distance(hollow, rays, meet_sphere(rays))
+    torch.testing.assert_close(found, torch.tensor([0.5, 0.5]), atol=2e-6, rtol=0)
+
+
+def test_the_reference_does_not_look_before_the_ray_begins() -> None:
+    """Bisection over the last 0.02 would begin at -0.015, in the solid behind the eye."""
+    walls = union(box(torch.tensor([0.5, 0.5, 0.1])), sphere(0.1, torch.tensor([0.0, 0, 0.21])))
+    rays = Rays(torch.tensor([[0.0, 0, 0.105]]), torch.tensor([[0.0, 0, 1]]))
+    found = reference_distance(walls, rays, meet_sphere(rays))
+    torch.testing.assert_close(found, torch.tensor([0.005]), atol=2e-6, rtol=0)
+
+
+@pytest.fixture(scope="module")
+def drawn() -> list[View]:
+    return list(analytic.analytic_views(sphere(0.6), 2, (32, 48), 0))
+
+
+def test_every_family_is_drawn_and_no_field_is_steeper_than_it_says(drawn: list[View]) -> None:
+    assert [view.model for view in drawn] == [name for name in analytic.NAMES for _ in range(2)]
+    for view in drawn:
+        points = (torch.tensor(view.shot.target) + 0.3 * torch.randn(500, 3)).requires_grad_()
+        (gradient,) = torch.autograd.grad(view.sdf(points).sum(), points)
+        assert gradient.norm(dim=-1).max() <= view.steepest * 1.001, view.model
+
+
+def test_every_family_but_the_camera_in_the_solid_is_seen(drawn: list[View]) -> None:
+    for view in drawn:
+        truth = reference_depth(lambda points, view=view: view.sdf(points) / view.steepest, view.camera())
+        seen = int(torch.isfinite(truth).sum())
+        assert (seen == 0) == (view.model == "camera in the solid"), view.model
+        if view.model.startswith("tiny"):
+            assert 0.1 * 0.3**2 < seen / truth.numel() < 0.9**2
+            assert view.sdf(torch.zeros(1, 3)) > 0.01, "off centre"
+
+
+@pytest.mark.parametrize("pixels", [1, 2, 3])
+def test_thin_solids_are_as_many_pixels_thick_as_they_say(pixels: int) -> None:
+    """Along a line through the middle at right angles to the plate, and over the gap."""
+    for name, inside in (("plate", True), ("gap", False)):
+        shot = replace(SHOT, size=100)
+        family = analytic.families(sphere(0.6))[f"{name} of {pixels} px"]
+        thin = family(np.random.default_rng(1), shot).sdf
+        middle = torch.from_numpy(np.random.default_rng(1).uniform(-0.2, 0.2, 3)).float()
+        points = middle + 0.25 * torch.nn.functional.normalize(torch.randn(20000, 3), dim=-1)
+        narrowest = thin(middle[None]).abs() * 2  # the distance to the wall on either side
+        assert float(narrowest) == pytest.approx(pixels * shot.pixel(middle), rel=0.02), name
+        assert (thin(middle[None]) < 0) == inside
+        assert (thin(points) < 0).any()
+
+
+def test_the_gap_can_be_seen_through() -> None:
+    family = analytic.families(sphere(0.6))["gap of 3 px"]
+    through = 0
+    for seed in range(6):
+        view = family(np.random.default_rng(seed), replace(SHOT, focal_mm=60.0))
+        middle = torch.from_numpy(np.random.default_rng(seed).uniform(-0.2, 0.2, 3)).float()
+        sight = torch.nn.functional.normalize(middle - SHOT.eye(), dim=0)
+        ray = Rays(SHOT.eye()[None], sight[None])
+        through += bool(reference_distance(view.sdf, ray, meet_sphere(ray)).isinf())
+    assert through >= 2
+
+
+def test_the_page_shows_the_summary_first_and_then_the_worst_views() -> None:
+    coarse = replace(CAUTIOUS, steps=3)
+    bad = measure_view(View("ball", Mixture(1, 2, 0.25), sphere(0.5), SHOT), "coarse", coarse)
+    good = measure_view(BALL, "coarse", CAUTIOUS)
+    assert bad.row.fails
+    assert badness(bad) > badness(good)
+    rows = [bad.row, good.row]
+    text = agreement_page("coarse", 7, summaries(rows), rows, [bad, good])
+    assert "1 of 2 random views pass" in text
+    assert text.index("fails: ") < text.index("<img")
+    assert text.count("<img") == 6
+    assert "0.75 · 1 + 0.25 · 2" in text
+    assert worst_picture([bad, good]).shape == (2 * 256 + 8, 3 * 256 + 16, 3)
+    reference, rendered, masks = pictures_of(bad)
+    assert (reference != 255).any(-1).sum() == (masks != 255).any(-1).sum() > (rendered != 255).any(-1).sum()
+    assert described(12) == "12"
+    assert described(None) == ""
+
+
+def test_a_bundled_model_is_measured_as_it_is() -> None:
+    (view,) = model_views(load_model("sofas"), 1, (16, 16), 0)
+    row = measure_view(view, "dynamic", STRATEGIES["dynamic"]).row
+    assert row.model == "sofas"
+    assert row.pixels > 0
+    assert row.camera.size == 16
+
+
+def test_sizes_that_no_image_has_are_refused() -> None:
+    for sizes in ((0, 4), (9, 8)):
+        with pytest.raises(ValueError, match=f"sizes from {sizes[0]} to {sizes[1]}"):
+            draw_shot(np.random.default_rng(0), sizes)
