@@ -1,6 +1,7 @@
 """The conventions of the camera: where it stands, where it looks, what a pixel sees."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from distrace.camera import Camera
-from distrace.rays import meet_sphere
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.trace import Trace
 
 f64 = torch.float64
 orbits = st.builds(
@@ -253,3 +255,102 @@ def test_numbers_that_make_no_camera_are_told() -> None:
     for factor in (0.0, -1.0, math.nan):
         with pytest.raises(ValueError, match="a sensor is resized by a positive one"):
             Camera.orbit(0, 0, 3).resized(factor)
+
+
+def test_an_orbit_of_tensors_is_that_of_their_numbers() -> None:
+    numbers = Camera.orbit(30, 20, 4.97, dtype=f64)
+    for az, el, away in ((30, 20, torch.tensor(4.97, dtype=f64)), (torch.tensor(30, dtype=f64), 20.0, 4.97)):
+        tensors = Camera.orbit(az, el, away)
+        assert tensors.T_world_camera.dtype == f64
+        torch.testing.assert_close(tensors.T_world_camera, numbers.T_world_camera)
+        assert torch.equal(tensors.intrinsics, numbers.intrinsics)
+    assert Camera.orbit(torch.tensor(30), 20, 4).T_world_camera.dtype == torch.float32
+    assert Camera.orbit(torch.tensor(30.0), 20, 4, dtype=f64).T_world_camera.dtype == f64
+
+
+@given(azimuth=st.floats(-360, 360), elevation=st.floats(-80, 80), distance=st.floats(1.5, 10))
+def test_an_orbit_has_the_derivatives_of_finite_differences(azimuth: float, elevation: float, distance: float) -> None:
+    where = [torch.tensor(number, dtype=f64, requires_grad=True) for number in (azimuth, elevation, distance)]
+    assert torch.autograd.gradcheck(lambda *at: Camera.orbit(*at, height=4, width=4).T_world_camera, where)
+
+
+def test_looking_at_a_point_has_the_derivatives_of_finite_differences() -> None:
+    eye, target = (torch.tensor(at, dtype=f64, requires_grad=True) for at in ([1.0, 2, 3], [0.1, -0.2, 0.3]))
+    assert torch.autograd.gradcheck(lambda *at: Camera.look_at(*at).T_world_camera, (eye, target))
+
+
+def test_tensors_with_batch_axes_give_a_batch_of_cameras() -> None:
+    azimuths, elevations = torch.tensor([0.0, 120, 240], dtype=f64), torch.tensor([[10.0], [90.0]], dtype=f64)
+    batch = Camera.orbit(azimuths, elevations, 3.0, height=4, width=6)
+    assert batch.T_world_camera.shape == (2, 3, 4, 4)
+    assert batch.rays().shape == (2, 3, 4, 6)
+    for row, elevation in enumerate(elevations[:, 0].tolist()):
+        for column, azimuth in enumerate(azimuths.tolist()):
+            alone = Camera.orbit(azimuth, elevation, 3.0, height=4, width=6, dtype=f64)
+            torch.testing.assert_close(batch.T_world_camera[row, column], alone.T_world_camera)
+            torch.testing.assert_close(batch.intrinsics[row, column], alone.intrinsics)
+
+
+def test_several_eyes_may_look_at_one_target_and_points_may_be_numbers() -> None:
+    eyes = torch.tensor([[0.0, 0, 3], [0, 3, 0], [2, 1, 2]])
+    batch = Camera.look_at(eyes, (0.1, 0.0, 0.2))
+    for number, eye in enumerate(eyes.tolist()):
+        alone = Camera.look_at(tuple(eye), (0.1, 0.0, 0.2))
+        torch.testing.assert_close(batch.T_world_camera[number], alone.T_world_camera)
+    assert torch.equal(Camera.look_at((0, 0, 3), torch.zeros(3)).T_world_camera[:3, 3], torch.tensor([0.0, 0, 3]))
+
+
+@pytest.mark.parametrize(
+    ("where", "repeated"),
+    [
+        ((torch.tensor([0.0, math.nan]), 0, 3), r"an orbit at \[0.0, nan\]°, 0.0°, 3.0 .* finite"),
+        ((0, torch.tensor(math.inf), 3), "an orbit at 0.0°, inf°, 3.0 .* finite"),
+        ((0, 0, torch.tensor([3.0, 0.0])), "its own place"),
+        ((torch.zeros(2), torch.zeros(3), 3), r"\[2\] and \[3\] and \[\] .* batch axes"),
+    ],
+    ids=str,
+)
+def test_tensors_that_no_camera_can_have_are_refused_in_words(where: tuple, repeated: str) -> None:
+    with pytest.raises(ValueError, match=repeated):
+        Camera.orbit(*where)
+
+
+def test_points_of_other_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"\[2\] and \[3\] were given; both are \[3\]"):
+        Camera.look_at(torch.ones(2), torch.zeros(3))
+    with pytest.raises(ValueError, match=r"\[2, 3\] and \[5, 3\] were given; they must"):
+        Camera.look_at(torch.ones(2, 3), torch.zeros(5, 3))
+
+
+def things() -> list[object]:
+    """One of each class, made anew."""
+    camera = Camera.orbit(30, 20, 3, height=2, width=3)
+    bounds, one = meet_sphere(camera.rays()), torch.ones(2, 3)
+    slope = torch.full((2, 3), math.nan)
+    trace = Trace(one * math.inf, one.long(), one, one, one.long(), slope=slope)
+    return [camera, camera.rays(), bounds, trace]
+
+
+@pytest.mark.parametrize("number", range(4))
+def test_equal_values_are_equal_and_others_are_not(number: int) -> None:
+    first, second = things()[number], things()[number]
+    assert first == second
+    assert hash(first) == hash(second)
+    others = [thing for k, thing in enumerate(things()) if k != number]
+    assert all(first != other for other in others)
+    assert first != "camera"
+
+
+def test_what_differs_in_one_value_or_in_precision_is_not_equal() -> None:
+    camera = Camera.orbit(30, 20, 3, height=2, width=3)
+    assert camera != Camera.orbit(30, 20, 3.0001, height=2, width=3)
+    assert camera != Camera.orbit(30, 20, 3, height=3, width=3)
+    assert camera != Camera.orbit(30, 20, 3, height=2, width=3, dtype=f64)
+    assert camera == Camera(camera.intrinsics.clone().requires_grad_(), camera.T_world_camera, 2, 3)
+    rays = camera.rays()
+    assert rays != rays[0]
+    assert Bounds(torch.zeros(2), torch.ones(2)) != Bounds(torch.zeros(2), torch.full((2,), math.nan))
+    assert {rays: 1}[Rays(rays.origins.clone(), rays.directions.clone())] == 1
+    trace = things()[3]
+    assert isinstance(trace, Trace)
+    assert trace != replace(trace, slope=None)

@@ -7,11 +7,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from distrace.equality import ByValue
 from distrace.rays import Rays
+from distrace.viewpoint import Number, Point, orbiting, together, upright
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, eq=False)
+class Camera(ByValue):
     """Intrinsics in pixels and the pose that maps camera to world; both may have batch axes and may require grad."""
 
     intrinsics: Float[Tensor, "*batch 3 3"]
@@ -35,8 +37,8 @@ class Camera:
 
     @staticmethod
     def look_at(
-        eye: Float[Tensor, "3"],
-        target: Float[Tensor, "3"],
+        eye: Point,
+        target: Point,
         *,
         height: int = 512,
         width: int = 512,
@@ -44,55 +46,51 @@ class Camera:
         sensor_mm: float = 32.0,
         focal_px: float | None = None,
     ) -> "Camera":
-        """A camera at `eye` that sees `target` in its middle and y pointing up.
+        """Returns a camera at `eye` that sees `target` in its middle and y pointing up.
 
-        The focal length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the
-        eye is at the target, or a length is not positive.
+        Points with batch axes give a batch of cameras; tensors that require grad keep their gradients. The focal
+        length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the eye is at
+        the target, a length is not positive, or shapes do not fit.
         """
         _check_size(height, width)
         focal = width * focal_mm / sensor_mm if focal_px is None and sensor_mm > 0 else (focal_px or 0.0)
         if not (focal > 0 and math.isfinite(focal)):
             given = focal_mm if focal_px is None else focal_px
             raise ValueError(f"a focal length of {given} on a sensor of {sensor_mm} was given; both must be positive")
+        eye, target = together(eye, target)
         forward = target - eye
         if not torch.isfinite(forward).all():
             raise ValueError(f"a camera at {eye.tolist()}, looking at {target.tolist()}, is not finite")
-        if not forward.norm() > 0:
+        if not (forward.norm(dim=-1) > 0).all():
             raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
-        forward = forward / forward.norm()
-        up = forward.new_tensor([0.0, 1.0, 0.0] if forward[1].abs() < 1 - 1e-6 else [0.0, 0.0, 1.0])
-        right = torch.linalg.cross(forward, up)
-        right = right / right.norm()
-        rotation = torch.stack([right, torch.linalg.cross(forward, right), forward], dim=1)
-        pose = torch.eye(4, dtype=eye.dtype)
-        pose[:3, :3], pose[:3, 3] = rotation, eye
-        intrinsics = torch.tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], dtype=eye.dtype)
-        return Camera.from_matrices(intrinsics, pose, height, width)
+        pose = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
+        pose[..., :3, :3] = upright(forward / forward.norm(dim=-1, keepdim=True))
+        pose[..., :3, 3] = eye
+        intrinsics = pose.new_tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+        return Camera.from_matrices(intrinsics.repeat(*eye.shape[:-1], 1, 1), pose, height, width)
 
     @staticmethod
     def orbit(
-        azimuth: float,
-        elevation: float,
-        distance: float,
+        azimuth: Number,
+        elevation: Number,
+        distance: Number,
         *,
         height: int = 512,
         width: int = 512,
         focal_mm: float = 60.0,
         sensor_mm: float = 32.0,
         focal_px: float | None = None,
-        dtype: torch.dtype = torch.float32,
+        dtype: torch.dtype | None = None,
     ) -> "Camera":
-        """A camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el), in degrees.
+        """Returns a camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el).
 
-        Raises `ValueError` for numbers that are not finite, and as `look_at` does.
+        Angles are in degrees. Tensors keep their gradients; tensors `[*batch]` give a batch of cameras. `dtype` is by
+        default the tensors', of numbers float32. Raises `ValueError` for what is not finite, and as `look_at` does.
         """
-        if not all(map(math.isfinite, (azimuth, elevation, distance))):
-            raise ValueError(f"an orbit at {azimuth}°, {elevation}°, {distance} was given; all three must be finite")
-        az, el = math.radians(azimuth), math.radians(elevation)
-        eye = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
+        eye = orbiting(azimuth, elevation, distance, dtype)
         return Camera.look_at(
-            torch.tensor(eye, dtype=dtype) * distance,
-            torch.zeros(3, dtype=dtype),
+            eye,
+            torch.zeros_like(eye),
             height=height,
             width=width,
             focal_mm=focal_mm,

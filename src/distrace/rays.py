@@ -6,9 +6,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.equality import ByValue
 
-@dataclass(frozen=True)
-class Rays:
+
+@dataclass(frozen=True, eq=False)
+class Rays(ByValue):
     """Half lines origin + t · direction; directions have unit length, so t is a distance."""
 
     origins: Float[Tensor, "*batch 3"]
@@ -31,8 +33,8 @@ class Rays:
         return Rays(self.origins.detach(), self.directions.detach())
 
 
-@dataclass(frozen=True)
-class Bounds:
+@dataclass(frozen=True, eq=False)
+class Bounds(ByValue):
     """The stretch of each ray that is looked at; empty (near > far) where the ray misses what bounds the field."""
 
     near: Float[Tensor, "*batch"]

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from distrace.equality import ByValue
 from distrace.field import SDF, asked
 from distrace.rays import Bounds, Rays
 
@@ -59,8 +60,8 @@ COARSE_TO_FINE = replace(AGGRESSIVE, coarse_levels=2)
 MARCHES = {"parallel": PARALLEL, "dynamic": DYNAMIC, "aggressive": AGGRESSIVE, "coarse_to_fine": COARSE_TO_FINE}
 
 
-@dataclass(frozen=True)
-class Trace:
+@dataclass(frozen=True, eq=False)
+class Trace(ByValue):
     """Where rays ended. Distances are along the unit ray; `inf` where a ray did not hit."""
 
     distance: Float[Tensor, "*batch"]
