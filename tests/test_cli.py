@@ -440,6 +440,23 @@ def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     assert result(tmp_path / "kept")["focal_percent_from_observation"] == pytest.approx(10, abs=1e-3)
 
 
+def test_mesh_says_what_is_doubtful_of_a_field(
+    model: Path, run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    run("mesh", model, "--resolution", 16, "--out", tmp_path)
+    assert result(tmp_path)["warnings"] == []
+    assert capsys.readouterr().err == ""
+    known = load_model(model)
+    last = getattr(known.decoder, f"lin{known.decoder.depth - 1}")
+    torch.nn.init.constant_(last.bias, -last.bias.item())
+    last.weight = torch.nn.Parameter(-last.weight.detach())
+    save_experiment(tmp_path / "inverted", known.decoder, known.codes, known.shapes)
+    run("mesh", tmp_path / "inverted", "--resolution", 16, "--out", tmp_path)
+    (sentence,) = result(tmp_path)["warnings"]
+    assert "is its sign inverted?" in sentence
+    assert capsys.readouterr().err == f"distrace: warning: {sentence}\n"
+
+
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
     run("bench", "trace", model, "--code", 1, "--size", 16, "--repeats", 1, "--out", tmp_path)
     assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}

@@ -1,6 +1,7 @@
 """Triangles from a field."""
 
 import math
+import warnings
 
 import numpy as np
 import pytest
@@ -8,6 +9,8 @@ import torch
 from skimage.measure import marching_cubes
 
 from distrace import primitives
+from distrace.errors import DoubtfulResult
+from distrace.field import SDF
 from distrace.mesh import MeshConfig, extract_mesh
 
 COARSE = MeshConfig(resolution=48)
@@ -110,3 +113,51 @@ def test_a_field_without_a_surface_is_told_so(sdf) -> None:
 def test_a_resolution_that_cannot_be_halved_is_refused(resolution: int) -> None:
     with pytest.raises(ValueError, match=f"resolution of {resolution}"):
         MeshConfig(resolution=resolution)
+
+
+def undefined(where: str) -> SDF:
+    """A ball of radius 0.6 that is NaN in part."""
+    parts = {
+        "on the surface": lambda points: points[..., 0] > 0.4,
+        "inside": lambda points: points.norm(dim=-1) < 0.3,
+        "beyond the ball": lambda points: points.norm(dim=-1) > 1.01,
+    }
+    return lambda points: BALL(points).masked_fill(parts[where](points), torch.nan)
+
+
+@pytest.mark.parametrize("where", ["on the surface", "inside"])
+def test_a_field_that_is_nan_in_part_is_warned_of(where: str) -> None:
+    with pytest.warns(DoubtfulResult, match=r"NaN at [\d,]+ of [\d,]+ points within 1\.0 of the origin") as said:
+        mesh = extract_mesh(undefined(where), COARSE)
+    assert len(said) == 1
+    assert mesh.is_watertight == (where == "inside")
+
+
+def test_a_field_that_is_nan_everywhere_is_refused_as_such() -> None:
+    with pytest.raises(ValueError, match=r"the field is NaN at .* there is no surface to extract"):
+        extract_mesh(lambda points: points[..., 0] * torch.nan, MeshConfig(resolution=16))
+
+
+def test_an_inverted_field_is_warned_of() -> None:
+    with pytest.warns(DoubtfulResult, match=r"negative at 512 of 512 points .* is its sign inverted\?") as said:
+        mesh = extract_mesh(lambda points: -BALL(points), COARSE)
+    assert len(said) == 1
+    assert mesh.area > 3 * extract_mesh(BALL, COARSE).area, "also what is around it"
+    with pytest.warns(DoubtfulResult, match="at 2.0 from the origin"):
+        extract_mesh(lambda points: -BALL(points), MeshConfig(resolution=48, radius=2.0))
+
+
+@pytest.mark.parametrize(
+    "sdf",
+    [
+        BALL,
+        undefined("beyond the ball"),
+        primitives.plane(torch.tensor([0.0, 1.0, 0.0]), 0.3),
+        primitives.difference(BALL, primitives.sphere(0.4)),
+    ],
+    ids=["ball", "NaN beyond the ball", "floor", "hollow"],
+)
+def test_other_fields_are_not_warned_of(sdf: SDF) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        extract_mesh(sdf, COARSE)

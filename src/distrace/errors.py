@@ -1,8 +1,12 @@
-"""Errors that end in one sentence, whatever a library raised underneath."""
+"""Errors and warnings of one sentence, whatever a library raised underneath."""
 
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+
+class DoubtfulResult(UserWarning):
+    """A result that was made, but that is probably not what was meant; one sentence says why."""
 
 
 @contextmanager

@@ -1,5 +1,7 @@
 """The surface of a field as triangles."""
 
+import math
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,6 +11,7 @@ from jaxtyping import Float, Int
 from skimage.measure import marching_cubes
 from torch import Tensor
 
+from distrace.errors import DoubtfulResult
 from distrace.field import SDF, asked, chunked, narrowed
 from distrace.steepness import steep, typical_slope
 
@@ -18,6 +21,8 @@ ROUNDS = 4  # at most, in which a field that is steeper than told is meshed agai
 ALMOST = 1.01  # × as steep as told is not steeper …
 STEEPER = 1.25  # … for as much more than was found
 LEVELS = 3  # cells are halved this often, and only those kept that can hold the surface
+AROUND = 512  # points of the ball's surface, at which a field is positive …
+INVERTED = 0.9  # … or, where it is negative at more than this share, probably inverted
 
 
 @dataclass(frozen=True)
@@ -43,9 +48,11 @@ class MeshConfig:
 def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh:
     """Marching cubes (Lorensen and Cline, SIGGRAPH 1987) on the cells of a grid that can hold the surface.
 
-    Normals point out. Raises `ValueError` where the field has no zero in the cube.
+    Normals point out. Raises `ValueError` where the field has no zero in the cube. Warns by `DoubtfulResult` of a field
+    that is NaN at points in the ball, whose mesh may be open, and of one that is negative all around the ball.
     """
-    sdf = sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE)
+    sdf = watched = _Watched(sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE), config.radius)
+    around = asked(sdf, _around(config))
     slope, _ = typical_slope(sdf, torch.empty(0, device=config.device), config.radius)
     if slope > config.steepest:
         config = replace(config, steepest=STEEPER * slope)
@@ -56,18 +63,68 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh
             break
         config = replace(config, steepest=STEEPER * found)
         grid = _values(sdf, config)
+    _warn_of_doubts(watched, around, config)
     known = np.isfinite(grid)
     vertices, faces, _, _ = marching_cubes(np.where(known, grid, 1.0), 0.0, mask=_whole_cells(known))
     return trimesh.Trimesh(vertices * config.width - config.radius, faces, process=False)
 
 
-def _values(sdf: SDF, config: MeshConfig) -> np.ndarray:
+class _Watched:
+    """The same field, counting the points in the ball that it was evaluated at, and those where it gave NaN."""
+
+    def __init__(self, sdf: SDF, radius: float) -> None:
+        self.sdf, self.radius = sdf, radius
+        self.evaluations, self.undefined = 0, 0
+
+    def __call__(self, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+        return self._seen(points, asked(self.sdf, points))
+
+    def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
+        """As the function of that name; what it returns is watched, too."""
+        values, near = narrowed(self.sdf, points)
+        return self._seen(points, values), lambda others: self._seen(others, asked(near, others))
+
+    def nan(self) -> str:
+        """Where the field was NaN, in words; empty where it never was."""
+        points = f"{self.undefined:,} of {self.evaluations:,} points within {self.radius} of the origin"
+        return f"the field is NaN at {points}" if self.undefined else ""
+
+    def _seen(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+        within = points.norm(dim=-1) <= self.radius
+        self.evaluations += int(within.sum())
+        self.undefined += int((within & values.isnan()).sum())
+        return values
+
+
+def _around(config: MeshConfig) -> Float[Tensor, "n 3"]:
+    """Points spread evenly over the surface of the ball, by the golden angle."""
+    number = torch.arange(AROUND, device=config.device) + 0.5
+    height, angle = 1 - 2 * number / AROUND, math.pi * (3 - 5**0.5) * number
+    across = (1 - height**2).sqrt()
+    return config.radius * torch.stack([across * angle.cos(), height, across * angle.sin()], dim=1)
+
+
+def _warn_of_doubts(watched: _Watched, around: Float[Tensor, "n"], config: MeshConfig) -> None:
+    if watched.undefined:
+        _warn(f"{watched.nan()}; the mesh may have holes there")
+    if (negative := int((around < 0).sum())) > INVERTED * AROUND:
+        share = f"{negative} of {AROUND} points at {config.radius} from the origin"
+        _warn(f"the field is negative at {share}, so the mesh is of what surrounds the shape; is its sign inverted?")
+
+
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, DoubtfulResult, stacklevel=5)  # where `extract_mesh`, which torch decorates, was called
+
+
+def _values(sdf: _Watched, config: MeshConfig) -> np.ndarray:
     """At the corners of the cells that can hold the surface; NaN elsewhere."""
     cells, near = _cells_at_surface(sdf, config)
     corners = _corners(cells, config.resolution + 1)
     points = corners.float() * config.width - config.radius
     found = near(points)
     if not ((found < 0).any() and (found > 0).any()):
+        if sdf.undefined:
+            raise ValueError(f"{sdf.nan()}, and has no zero elsewhere: there is no surface to extract")
         raise ValueError(
             f"the field has no zero within {config.radius} of the origin: there is no surface to extract; if"
             f" there is, the field is steeper than {config.steepest:.3g} per length: say how steep by `steepest`"

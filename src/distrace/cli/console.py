@@ -2,6 +2,7 @@
 
 import sys
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -21,7 +22,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from distrace.errors import explained
+from distrace.errors import DoubtfulResult, explained
 from distrace.files import save_json
 
 console = Console()
@@ -36,6 +37,24 @@ class Run:
     out: Path
     device: torch.device
     began: float = field(default_factory=time.perf_counter)
+    warnings: list[str] = field(default_factory=list)  # sentences of DoubtfulResult
+
+    @contextmanager
+    def noticing(self) -> Iterator[None]:
+        """Says each `DoubtfulResult` in one line on stderr, and keeps it. Other warnings are shown as ever."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", DoubtfulResult)
+            show = warnings.showwarning
+
+            def notice(message: Warning | str, category: type[Warning], *where: Any) -> None:
+                if not issubclass(category, DoubtfulResult):
+                    show(message, category, *where)
+                elif str(message) not in self.warnings:
+                    self.warnings.append(str(message))
+                    errors.print(f"distrace: warning: {message}", markup=False, highlight=False)
+
+            warnings.showwarning = notice
+            yield
 
     def finish(self, facts: dict[str, Any]) -> None:
         """Writes `result.json` and says where everything is."""

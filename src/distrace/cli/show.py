@@ -142,8 +142,9 @@ class Mesh:
     def run(self) -> None:
         run = start(self.out, self.device)
         counted = Counted(opened(self.model, run.device).field(self.code))
-        surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
+        with run.noticing():
+            surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
         save_mesh(run.out / "mesh.ply", surface)
         console.print(f"{len(surface.faces)} faces")
         evaluations = {"evaluations": counted.evaluations, "setup_evaluations": counted.evaluations}
-        run.finish({**evaluations, "faces": len(surface.faces)})
+        run.finish({**evaluations, "faces": len(surface.faces), "warnings": run.warnings})
