@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 from torch import Tensor
 
-from distrace.evaluation.bench import OUTLIER, reference_depth
+from distrace.evaluation.bench import OUTLIER, in_turn, reference_depth
 from distrace.evaluation.shots import Mixture, Shot, View
 from distrace.metrics import depth_errors, iou
 from distrace.render import Buffers, Config, render
@@ -80,13 +80,15 @@ class Summary:
 def measure_view(view: View, strategy: str = "default", config: Config | None = None) -> Measured:
     """Renders a view by a configuration, or as `render` does by default, and compares it with the reference."""
     camera = view.camera()
+
+    def rendered() -> Buffers:
+        return render(view.sdf, camera) if config is None else render(view.sdf, camera, config=config)
+
+    buffers, seconds, _ = in_turn({strategy: rendered}, 1)[strategy]
     began = time.perf_counter()
-    with torch.no_grad():
-        buffers = render(view.sdf, camera) if config is None else render(view.sdf, camera, config=config)
-    rendered = time.perf_counter()
     truth = reference_depth(lambda points: view.sdf(points) / view.steepest, camera)
-    took = rendered - began, time.perf_counter() - rendered
-    return Measured(_row(view, strategy, buffers, truth, *took), view, buffers, truth)
+    row = _row(view, strategy, buffers, truth, seconds, time.perf_counter() - began)
+    return Measured(row, view, buffers, truth)
 
 
 def largest_part(mask: Bool[np.ndarray, "height width"]) -> int:
