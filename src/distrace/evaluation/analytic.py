@@ -22,6 +22,7 @@ SATURATIONS = (1, 10, 15, 30)  # k of tanh(k f)
 WIDTHS = (1, 2, 3)  # pixels
 THICKEST = 0.4
 TINY = (1e-3, 1e-2)  # radii, far below the lattice's cells
+OF_DECODER = ("decoder × 2", "clamped")
 HARD = ("decoder × 2", "thin plate", "high frequencies", "gap of a pixel", "clamped")
 
 
@@ -76,6 +77,8 @@ def _saturated(k: float, random: np.random.Generator, shot: Shot) -> Drawn:
 
 
 def _hard(decoder: SDF, name: str, random: np.random.Generator, shot: Shot) -> Drawn:
+    if name in OF_DECODER:
+        shot = replace(shot, size=max(1, shot.size // 2))  # of all families the reference is slowest with these
     hard = hard_fields(decoder, shot.camera())[name]
     return Drawn(hard.sdf, aimed(shot, hard.sdf, random), hard.steepest)
 
