@@ -488,9 +488,14 @@ def test_bench_views_writes_rows_a_summary_and_the_worst_views(model: Path, run:
         assert [row[key] for row in again["rows"]] == [row[key] for row in facts["rows"]], key
 
 
-def test_bench_views_measures_analytic_fields_alone_where_no_model_is_named(run: Command, tmp_path: Path) -> None:
+def test_bench_views_measures_analytic_fields_alone_where_no_model_is_named(
+    run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
     run("bench", "views", "--fields", "--views", 1, "--sizes", 16, 16, "--out", tmp_path)
     assert [row["model"] for row in result(tmp_path, "rows")["rows"]] == list(NAMES)
+    said = capsys.readouterr().out
+    for line in result(tmp_path, "summary")["summary"]:
+        assert any(text.startswith(line["model"]) and text.endswith(line["bar"]) for text in said.splitlines()), line
 
 
 def test_without_a_command_or_with_help_it_says_what_there_is(run: Command, capsys: pytest.CaptureFixture) -> None:

@@ -249,9 +249,13 @@ def test_the_page_shows_the_summary_first_and_then_the_worst_views() -> None:
     assert text.index("fails: ") < text.index("<img")
     assert text.count("<img") == 6
     assert "0.75 · 1 + 0.25 · 2" in text
-    assert worst_picture([bad, good]).shape == (2 * 256 + 8, 3 * 256 + 16, 3)
     reference, rendered, masks = pictures_of(bad)
     assert (reference != 255).any(-1).sum() == (masks != 255).any(-1).sum() > (rendered != 255).any(-1).sum()
+    height, width, _ = reference.shape
+    assert 128 < max(height, width) <= 256, "cropped, and enlarged"
+    assert (masks != 255).any(-1).mean() > 0.4
+    assert (masks == 255).all(-1)[:4].all(), "with a margin"
+    assert worst_picture([bad, good]).shape == (2 * height + 8, 3 * width + 16, 3)
     assert described(12) == "12"
     assert described(None) == ""
 
@@ -268,3 +272,8 @@ def test_sizes_that_no_image_has_are_refused() -> None:
     for sizes in ((0, 4), (9, 8)):
         with pytest.raises(ValueError, match=f"sizes from {sizes[0]} to {sizes[1]}"):
             draw_shot(np.random.default_rng(0), sizes)
+
+
+def test_a_view_of_nothing_has_a_picture_too() -> None:
+    nothing = measure_view(View("nothing", None, sphere(0.5, torch.tensor([0.0, 9, 0])), SHOT), "cautious", CAUTIOUS)
+    assert all((picture == 255).all() and picture.shape == (256, 256, 3) for picture in pictures_of(nothing))

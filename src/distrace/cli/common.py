@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import torch
 import trimesh
 import tyro
-from rich.table import Table
 
 from distrace import shading
 from distrace.camera import Camera
@@ -90,14 +89,14 @@ def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Prints rows, not narrower than they are; what a row has not stays empty."""
+    """Prints rows in full, however narrow the terminal is; what a row has not stays empty."""
     names = list(dict.fromkeys(name for row in rows for name in row))
-    cells = [[short(row.get(name, "")) for name in names] for row in rows]
-    shown = Table(box=None, padding=(0, 1, 0, 0))
-    for name, column in zip(names, zip(*cells)):
+    columns: list[list[str]] = []
+    for name in names:
+        column = [name, *(short(row.get(name, "")) for row in rows)]
+        width = max(map(len, column))
         numeric = all(isinstance(row.get(name, 0), int | float) for row in rows)
-        width = max(len(name), *(len(cell) for cell in column))
-        shown.add_column(name, justify="right" if numeric else "left", min_width=width, no_wrap=True)
-    for line in cells:
-        shown.add_row(*line)
-    console.print(shown, soft_wrap=True, crop=False)
+        columns.append([cell.rjust(width) if numeric else cell.ljust(width) for cell in column])
+    for number, line in enumerate(zip(*columns)):
+        style = "" if number else "bold"
+        console.print(" ".join(line).rstrip(), style=style, soft_wrap=True, markup=False, highlight=False)

@@ -4,6 +4,8 @@ from collections.abc import Sequence
 from dataclasses import asdict
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from distrace import shading, surface
 from distrace.evaluation.shots import Mixture
@@ -23,6 +25,7 @@ from distrace.pages.report import View as Rendered
 from distrace.shading import Picture
 
 SIDE = 256  # pixels; smaller pictures are enlarged towards it
+MARGIN = 4  # pixels around what is seen
 COLOURS = {"both": shading.AGREE, "missed": shading.MISSING, "added": shading.EXTRA}
 BAR = (
     f"A view passes with an IoU of at least {LEAST_IOU} (an object of fewer than {SMALL} pixels: with at most {WRONG}"
@@ -67,13 +70,26 @@ def worst_picture(worst: Sequence[Measured]) -> Picture:
 
 
 def pictures_of(measured: Measured) -> list[Picture]:
-    """The reference shaded, the rendering shaded, and the difference of their masks; small images enlarged."""
+    """The reference shaded, the rendering shaded, and the difference of their masks.
+
+    They are cropped to what is in either, and enlarged where that is small.
+    """
     true = torch.isfinite(measured.truth)
     with torch.no_grad():
         rendered = Rendered.of(measured.buffers).shaded
     pictures = [_shaded_reference(measured), rendered, shading.mask_comparison(true, measured.buffers.mask)]
-    times = max(1, SIDE // measured.row.camera.size)
-    return [picture.repeat(times, 0).repeat(times, 1) for picture in pictures]
+    part = _around(true | measured.buffers.mask)
+    times = max(1, SIDE // max(pictures[0][part].shape))
+    return [picture[part].repeat(times, 0).repeat(times, 1) for picture in pictures]
+
+
+def _around(mask: Bool[Tensor, "height width"]) -> tuple[slice, slice]:
+    """The rows and columns of a mask, and a few beside; all where it is empty."""
+    found = mask.nonzero()
+    if not len(found):
+        return slice(None), slice(None)
+    (top, left), (bottom, right) = found.amin(0).tolist(), found.amax(0).tolist()
+    return slice(max(0, top - MARGIN), bottom + MARGIN + 1), slice(max(0, left - MARGIN), right + MARGIN + 1)
 
 
 def described(code: int | Mixture | None) -> str:
