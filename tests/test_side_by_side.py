@@ -8,9 +8,9 @@ import torch
 
 from distrace import quickest
 from distrace.checkpoint import load_model
-from distrace.decoder import CPU_CHUNK
 from distrace.fitting.side_by_side import Fields, Groups
 from distrace.fitting.starts import Step
+from distrace.rounded import CHUNK
 
 MODEL = load_model("sofas")
 
@@ -22,7 +22,7 @@ def rounded_products(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def points_of(fit: int, question: int) -> torch.Tensor:
-    count = [3, 40, 2 * CPU_CHUNK + 1][(fit + question) % 3]
+    count = [3, 40, 2 * CHUNK + 1][(fit + question) % 3]
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(10 * fit + question)) - 0.5
 
 

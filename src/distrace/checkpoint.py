@@ -16,10 +16,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.batch_field import BatchField
+from distrace.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.errors import explained
 from distrace.experiment import read_weights, write_weights
-from distrace.field import SDF
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
@@ -35,8 +35,8 @@ class Model:
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "length"]) -> SDF:
-        """The signed distance field of a training code, or of any code.
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
+        """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
 
         Raises `ValueError` for a number or a length that the model has not.
         """

@@ -4,7 +4,7 @@ import reprlib
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
@@ -58,6 +58,20 @@ def chunked(sdf: SDF, size: int) -> SDF:
         return torch.cat([asked(sdf, part) for part in flat.split(size)]).reshape(points.shape[:-1])
 
     return field
+
+
+def flattened(
+    function: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]], points: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch"]:
+    """A function of points [n, 3], at points of any shape."""
+    return function(points) if points.dim() == 2 else function(points.reshape(-1, 3)).reshape(points.shape[:-1])
+
+
+def in_chunks(function: Callable[..., Tensor], size: int, *rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "n *_"]:
+    """A function of tensors of n rows, called with at most `size` rows of each at a time."""
+    if len(rows[0]) <= size:
+        return function(*rows)
+    return torch.cat([function(*part) for part in zip(*(each.split(size) for each in rows), strict=True)])
 
 
 def placed(sdf: SDF, T_world_object: Float[Tensor, "4 4"]) -> SDF:

@@ -14,13 +14,15 @@ from greenlet import getcurrent, greenlet
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.decoder import Decoder
 from distrace.field import SDF, chunked
 from distrace.fitting.starts import Stepped, charged
 from distrace.quickest import quickest
-from distrace.rounded import Asked, Rounded
+from distrace.rounded import CHUNK, Rounded
 
 Values = Float[Tensor, "_"]
+Asked = tuple[Float[Tensor, "length"], Float[Tensor, "_ 3"]]
+"""A code, and points to have its shape's values at."""
 
 
 class Fields:
@@ -34,13 +36,12 @@ class Fields:
         """Of one shape."""
         if self.hub is None or not isinstance(self.quick, Rounded):
             return self.quick.field(code)
-        layers = self.quick.layers(code)
 
         def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
             assert self.hub is not None
-            return _switched(self.hub, (layers, points.reshape(-1, 3))).reshape(points.shape[:-1])
+            return _switched(self.hub, (code, points.reshape(-1, 3))).reshape(points.shape[:-1])
 
-        return chunked(evaluate, CPU_CHUNK)
+        return chunked(evaluate, CHUNK)
 
     def side_by_side(self, fits: Sequence[Iterator[Stepped]]) -> list[list[Stepped]]:
         """All steps of each. The time that these took is shared out among them."""
@@ -66,11 +67,19 @@ class Fields:
         answers: list[Values] = []
         together: list[Asked] = []
         for question in questions:
-            if sum(len(points) for _, points in [*together, question]) > CPU_CHUNK:
-                answers += self.quick.run(together)
+            if sum(len(points) for _, points in [*together, question]) > CHUNK:
+                answers += self._together(together)
                 together = []
             together.append(question)
-        return answers + self.quick.run(together)
+        return answers + self._together(together)
+
+    def _together(self, questions: Sequence[Asked]) -> list[Values]:
+        if not questions:
+            return []
+        counts = [len(points) for _, points in questions]
+        shape = torch.arange(len(counts)).repeat_interleave(torch.tensor(counts))
+        field = self.quick.fields(torch.stack([code for code, _ in questions])).select(shape)
+        return list(field(torch.cat([points for _, points in questions])).split(counts))
 
 
 class Groups(Generic[Stepped]):
