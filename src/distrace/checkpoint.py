@@ -17,9 +17,10 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.batch_field import BatchField
-from distrace.decoder import Decoder, NetworkSpecs, ShapeField
+from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 from distrace.experiment import read_weights, write_weights
+from distrace.field import SDF
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
@@ -35,7 +36,7 @@ class Model:
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
         """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
 
         Raises `ValueError` for a number or a length that the model has not.
