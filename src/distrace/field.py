@@ -4,7 +4,7 @@ import reprlib
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float, Shaped
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
@@ -92,6 +92,15 @@ def narrowed(sdf: SDF, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"]
     """Values at points, and a field that is the same around them; cheaper, where the field has a way to be."""
     narrow = getattr(sdf, "narrowed", None)
     return narrow(points) if narrow else (asked(sdf, points), sdf)
+
+
+def at_rows(sdf: SDF, rows: Int[Tensor, "m"]) -> SDF:
+    """The field at some of the points that it was made for, by their numbers; most fields are made for any points.
+
+    A selection of shapes, `BatchField.select`, is made for points in an order.
+    """
+    some = getattr(sdf, "at_rows", None)
+    return some(rows) if some else sdf
 
 
 class Counted:

@@ -4,7 +4,7 @@ Marquardt, SIAM J. 1963; damping as in Madsen, Nielsen and Tingleff, *Methods fo
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -82,6 +82,60 @@ class Residuals:
         return step.to(self.values), float(step @ (damped * step - slope)) / 2
 
 
+@dataclass
+class Descent(Generic[State]):
+    """The way down from one start: the best state so far, and how the next step is damped."""
+
+    state: State
+    residuals: Residuals
+    damping: float
+    growth: float = 2.0  # of the damping, at the next step that is rejected
+    accepted: bool = False
+    settled: bool = False  # no further step lowers the loss
+
+    def step(self, config: SolverConfig, iteration: int) -> tuple[Float[Tensor, "unknowns"], float]:
+        """The step to try, and by how much it should lower the loss."""
+        return self.residuals.step(config.scale_at(iteration), self.damping, config.kernel, config.even)
+
+    def decide(
+        self,
+        candidate: State,
+        then: Residuals,
+        step: tuple[Float[Tensor, "unknowns"], float],
+        config: SolverConfig,
+        iteration: int,
+    ) -> None:
+        """Goes to the candidate, with residuals `then`, if its loss is lower; changes the damping by the gain ratio."""
+        scale = config.scale_at(iteration)
+        before, after = (each.loss(scale, config.kernel) for each in (self.residuals, then))
+        self.accepted = after < before
+        if self.accepted:
+            gain = (before - after) / max(step[1], 1e-30)
+            self.damping = max(self.damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING)
+            self.growth, self.state, self.residuals = 2.0, candidate, then
+        else:
+            self.damping, self.growth = min(self.damping * self.growth, LARGEST_DAMPING), 2 * self.growth
+        little = step[0].norm() <= config.settled or abs(before - after) <= config.settled * before
+        self.settled = bool(little) and scale == config.scale_at(config.iterations)
+
+
+def descend(
+    descents: Sequence[Descent[State]],
+    residuals: Callable[[Sequence[State]], Sequence[Residuals]],
+    moved: Callable[[Sequence[State], Sequence[Float[Tensor, "unknowns"]]], Sequence[State]],
+    config: SolverConfig,
+    iteration: int,
+) -> None:
+    """One iteration of several starts: states are moved together, and their residuals evaluated together.
+
+    Each start has its own damping, and its step is accepted or rejected by itself.
+    """
+    steps = [descent.step(config, iteration) for descent in descents]
+    candidates = moved([descent.state for descent in descents], [step for step, _ in steps])
+    for descent, candidate, then, step in zip(descents, candidates, residuals(candidates), steps, strict=True):
+        descent.decide(candidate, then, step, config, iteration)
+
+
 @dataclass(frozen=True)
 class Solution(Generic[State]):
     """Where an iteration stands: the best state so far, and its loss at the scale of the end."""
@@ -102,23 +156,14 @@ def minimise(
     config: SolverConfig = SolverConfig(),
 ) -> Iterator[Solution[State]]:
     """Moves a state along the unknowns' steps until its residuals vanish, or no step lowers the loss."""
-    state, damping, growth = start, config.damping, 2.0
-    now = residuals(state)
+    descent = Descent(start, residuals(start), config.damping)
     for iteration in range(config.iterations):
-        began, scale = time.perf_counter(), config.scale_at(iteration)
-        step, expected = now.step(scale, damping, config.kernel, config.even)
-        candidate = moved(state, step)
-        then = residuals(candidate)
-        before, after = now.loss(scale, config.kernel), then.loss(scale, config.kernel)
-        accepted = after < before
-        if accepted:
-            gain = (before - after) / max(expected, 1e-30)
-            damping, growth = max(damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING), 2.0
-            state, now = candidate, then
-        else:
-            damping, growth = min(damping * growth, LARGEST_DAMPING), 2 * growth
-        seconds = time.perf_counter() - began
-        yield Solution(iteration + 1, state, now.loss(config.scale, config.kernel), damping, accepted, seconds, now)
-        little = step.norm() <= config.settled or abs(before - after) <= config.settled * before
-        if little and scale == config.scale_at(config.iterations):
+        began = time.perf_counter()
+        step = descent.step(config, iteration)
+        candidate = moved(descent.state, step[0])
+        descent.decide(candidate, residuals(candidate), step, config, iteration)
+        seconds, now = time.perf_counter() - began, descent.residuals
+        loss = now.loss(config.scale, config.kernel)
+        yield Solution(iteration + 1, descent.state, loss, descent.damping, descent.accepted, seconds, now)
+        if descent.settled:
             return

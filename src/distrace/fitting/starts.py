@@ -160,15 +160,6 @@ def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
     return step
 
 
-def ended(steps: Iterator[Stepped], judge: Judge[Stepped]) -> Iterator[Stepped]:
-    """All of them, the last one judged and charged with that."""
-    step = next(steps)
-    for following in steps:
-        yield step
-        step = following
-    yield charged(judge(step), [step])
-
-
 def decided(ends: Sequence[Stepped], compared: Sequence[Stepped] = ()) -> Stepped:
     """The best of judged ends, with what judging them, and all that was compared before, took."""
     return charged(replace(_best(ends), seconds=0.0, evaluations=0), [*compared, *ends])

@@ -1,7 +1,10 @@
 """Which of several completions contradicts least what was seen: all rays count, none for more than it can tell."""
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
+from distrace.batch_field import BatchField
 from distrace.field import SDF
 from distrace.fitting.noise_level import expected
 from distrace.fitting.seen import Seen
@@ -21,7 +24,22 @@ def contradiction(sdf: SDF, seen: Seen, config: TraceConfig) -> float:
     surface, and a single ray that misses a wing outweighs a hundred others.
     """
     trace = sphere_trace(sdf, seen.rays, seen.bounds, config)
-    deviation = (trace.distance - seen.observed).abs().clamp_max(MOST).masked_fill(~trace.hit, MOST)
+    return _contradiction(trace.distance, trace.hit, seen)
+
+
+@torch.no_grad()
+def contradictions(field: BatchField, seen: Seen, config: TraceConfig) -> list[float]:
+    """That of each shape's surface, all of them traced together."""
+    rays = torch.arange(len(seen.observed), device=seen.observed.device)
+    shape = torch.arange(len(field), device=rays.device).repeat_interleave(len(rays))
+    every = seen[rays.repeat(len(field))]
+    trace = sphere_trace(field.select(shape), every.rays, every.bounds, config)
+    each = zip(trace.distance.reshape(len(field), -1), trace.hit.reshape(len(field), -1), strict=True)
+    return [_contradiction(distance, hit, seen) for distance, hit in each]
+
+
+def _contradiction(distance: Float[Tensor, "n"], hit: Bool[Tensor, "n"], seen: Seen) -> float:
+    deviation = (distance - seen.observed).abs().clamp_max(MOST).masked_fill(~hit, MOST)
     beyond = (deviation - expected(seen.noise, MOST))[seen.known]
     depth = beyond.sum() / max(int(seen.known.sum()), 1)
-    return float(depth) + MOST * (1 - iou(trace.hit, seen.is_object))
+    return float(depth) + MOST * (1 - iou(hit, seen.is_object))
