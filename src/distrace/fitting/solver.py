@@ -93,31 +93,6 @@ class Descent(Generic[State]):
     accepted: bool = False
     settled: bool = False  # no further step lowers the loss
 
-    def step(self, config: SolverConfig, iteration: int) -> tuple[Float[Tensor, "unknowns"], float]:
-        """The step to try, and by how much it should lower the loss."""
-        return self.residuals.step(config.scale_at(iteration), self.damping, config.kernel, config.even)
-
-    def decide(
-        self,
-        candidate: State,
-        then: Residuals,
-        step: tuple[Float[Tensor, "unknowns"], float],
-        config: SolverConfig,
-        iteration: int,
-    ) -> None:
-        """Goes to the candidate, with residuals `then`, if its loss is lower; changes the damping by the gain ratio."""
-        scale = config.scale_at(iteration)
-        before, after = (each.loss(scale, config.kernel) for each in (self.residuals, then))
-        self.accepted = after < before
-        if self.accepted:
-            gain = (before - after) / max(step[1], 1e-30)
-            self.damping = max(self.damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING)
-            self.growth, self.state, self.residuals = 2.0, candidate, then
-        else:
-            self.damping, self.growth = min(self.damping * self.growth, LARGEST_DAMPING), 2 * self.growth
-        little = step[0].norm() <= config.settled or abs(before - after) <= config.settled * before
-        self.settled = bool(little) and scale == config.scale_at(config.iterations)
-
 
 def descend(
     descents: Sequence[Descent[State]],
@@ -126,14 +101,23 @@ def descend(
     config: SolverConfig,
     iteration: int,
 ) -> None:
-    """One iteration of several starts: states are moved together, and their residuals evaluated together.
-
-    Each start has its own damping, and its step is accepted or rejected by itself.
-    """
-    steps = [descent.step(config, iteration) for descent in descents]
+    """One iteration of several starts, each with its own damping, whose states are moved and evaluated together."""
+    scale, kernel = config.scale_at(iteration), config.kernel
+    steps = [each.residuals.step(scale, each.damping, kernel, config.even) for each in descents]
     candidates = moved([descent.state for descent in descents], [step for step, _ in steps])
-    for descent, candidate, then, step in zip(descents, candidates, residuals(candidates), steps, strict=True):
-        descent.decide(candidate, then, step, config, iteration)
+    tried = zip(descents, steps, candidates, residuals(candidates), strict=True)
+    for descent, (step, expected), candidate, then in tried:
+        before, after = descent.residuals.loss(scale, kernel), then.loss(scale, kernel)
+        descent.accepted = after < before
+        if descent.accepted:
+            gain = (before - after) / max(expected, 1e-30)
+            descent.damping = max(descent.damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING)
+            descent.growth, descent.state, descent.residuals = 2.0, candidate, then
+        else:
+            descent.damping = min(descent.damping * descent.growth, LARGEST_DAMPING)
+            descent.growth *= 2
+        little = step.norm() <= config.settled or abs(before - after) <= config.settled * before
+        descent.settled = bool(little) and scale == config.scale_at(config.iterations)
 
 
 @dataclass(frozen=True)
@@ -159,9 +143,7 @@ def minimise(
     descent = Descent(start, residuals(start), config.damping)
     for iteration in range(config.iterations):
         began = time.perf_counter()
-        step = descent.step(config, iteration)
-        candidate = moved(descent.state, step[0])
-        descent.decide(candidate, residuals(candidate), step, config, iteration)
+        descend([descent], lambda states: [residuals(states[0])], lambda x, by: [moved(x[0], by[0])], config, iteration)
         seconds, now = time.perf_counter() - began, descent.residuals
         loss = now.loss(config.scale, config.kernel)
         yield Solution(iteration + 1, descent.state, loss, descent.damping, descent.accepted, seconds, now)

@@ -111,16 +111,11 @@ def stage_of(
         if not going:
             break
         descend([descents[k] for k in going], problem.residuals, problem.moved, solver, iteration)
-        described = [_described(problem, descents[k]) for k in going]
         seconds, began = (time.perf_counter() - began) / len(going), time.perf_counter()
         spent, evaluations = problem.evaluations - evaluations, Counter(problem.evaluations)
-        for k, (terms, code) in zip(going, described, strict=True):
-            start, before = done[k]
+        for k in going:
+            (start, before), state = done[k], descents[k].state
+            terms, code = problem.terms(state, descents[k].residuals), problem.prior.code(state.w)
             number = before + len(steps[k]) + 1
             steps[k].append(Step(start, number, sum(terms.values()), terms, code, seconds, spent[k]))
     return steps, descents
-
-
-def _described(problem: Any, descent: Descent) -> tuple[dict[str, float], Float[Tensor, "length"]]:
-    """The terms of a start's loss, and its code."""
-    return problem.terms(descent.state, descent.residuals), problem.prior.code(descent.state.w)
