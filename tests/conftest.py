@@ -1,7 +1,6 @@
 """One thread, few examples, types checked in a test's first calls; where the contract says 30, a `float` takes it."""
 
 from collections import Counter
-from contextvars import ContextVar
 from functools import partial, wraps
 from types import FunctionType
 from typing import Any
@@ -51,23 +50,6 @@ def _at_first(function: Any = None, *, typechecker: Any) -> Any:
 
     return called
 
-
-class _Stacks:
-    """What jaxtyping knows of the calls it is in, for each greenlet apart, where it has it for each thread."""
-
-    _own: ContextVar[list] = ContextVar("memo_stack")  # a greenlet begins with none
-
-    def __getattr__(self, name: str) -> list:
-        try:
-            return self._own.get()
-        except LookupError:
-            raise AttributeError(name) from None
-
-    def __setattr__(self, name: str, value: list) -> None:
-        self._own.set(value)
-
-
-jaxtyping._storage._shape_storage = _Stacks()
 
 # The import hook looks these names up when it checks a module.
 jaxtyping.jaxtyped = _at_first

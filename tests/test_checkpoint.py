@@ -531,3 +531,11 @@ def test_an_experiment_whose_saving_fails_stays_as_it_was(tmp_path, monkeypatch)
     with pytest.raises(OSError, match="disk full"):
         save_experiment(tmp_path, model.decoder, model.codes, model.shapes)
     assert files(tmp_path) == before
+
+
+def test_several_codes_give_the_field_of_several_shapes() -> None:
+    model = load_model("sofas")
+    points = torch.rand(6, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    values = model.field(model.codes[:3]).select(torch.tensor([2, 2, 0, 1, 0, 1]))(points)
+    for point, value, shape in zip(points, values, [2, 2, 0, 1, 0, 1], strict=True):
+        torch.testing.assert_close(value, model.field(shape)(point))

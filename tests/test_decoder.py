@@ -1,11 +1,13 @@
 """The decoder, against DeepSDF's forward pass written out in numpy (Park et al., CVPR 2019, and their own code)."""
 
 import math
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 import torch
 from torch.func import functional_call
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.field import chunked
@@ -126,7 +128,10 @@ def test_more_points_than_a_chunk_are_as_good_as_few(monkeypatch, points):
     code = a_code(decoder)
     whole = decoder.field(code)(points)
     monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+    monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
     torch.testing.assert_close(decoder.field(code)(points), whole)
+    with torch.no_grad():
+        torch.testing.assert_close(decoder.field(code)(points), whole)
 
 
 def test_gradients_agree_with_finite_differences_in_code_and_points(decoder, points):
@@ -226,7 +231,7 @@ def test_a_narrowed_field_may_be_narrowed_again(points):
 
 def test_points_of_many_chunks_are_narrowed_together(monkeypatch, points):
     decoder, _ = wide()
-    monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+    monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
     field = decoder.field(a_code(decoder))
     values, narrow = field.narrowed(a_place(points))
     torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
@@ -255,9 +260,167 @@ def test_values_where_a_field_is_narrowed_carry_no_gradient(points):
     assert not field.narrowed(points)[0].requires_grad
 
 
+def a_selection(count: int, shapes: int) -> torch.Tensor:
+    return torch.randint(shapes, (count,), generator=torch.Generator().manual_seed(3))
+
+
+def test_a_batch_is_the_field_of_each_of_its_shapes(decoder, points):
+    codes, sets = a_code(decoder, 4), points.reshape(4, 5, 2, 3)
+    field = decoder.field(codes)
+    assert len(field) == 4
+    assert torch.equal(field.codes, codes)
+    each = torch.stack([decoder.field(code)(some) for code, some in zip(codes, sets)])
+    torch.testing.assert_close(field(sets), each)
+    with torch.no_grad():
+        torch.testing.assert_close(field(sets), each)
+    for single, code, some in zip(field, codes, sets):
+        assert isinstance(single, ShapeField)
+        assert torch.equal(single.code, code)
+        assert torch.equal(single(some), decoder.field(code)(some))
+    assert torch.equal(field[2](points), decoder.field(codes[2])(points))
+
+
+@pytest.mark.parametrize("batch", [(), (2,), (0,), (2, 1)])
+def test_a_selection_takes_each_point_for_its_own_shape(decoder, points, batch):
+    codes, shape = a_code(decoder, 3), a_selection(20, 3)
+    field = decoder.field(codes).select(shape)
+    given = points[:20].expand(*batch, 20, 3)
+    each = torch.stack([decoder.field(codes[b])(point) for b, point in zip(shape, points)]).expand(*batch, 20)
+    torch.testing.assert_close(field(given), each)
+    with torch.no_grad():
+        torch.testing.assert_close(field(given), each)
+
+
+def test_gradients_of_a_selection_agree_with_finite_differences(decoder, points):
+    codes, shape = a_code(decoder, 3).requires_grad_(), a_selection(5, 3)
+    points = points[:5].requires_grad_()
+
+    def values(codes, points):
+        return decoder.field(codes).select(shape)(points)
+
+    assert torch.autograd.gradcheck(values, (codes, points))
+    assert torch.autograd.gradgradcheck(values, (codes, points), atol=1e-4)
+
+
+def test_gradients_reach_the_weights_through_a_selection(points):
+    decoder = randomised(PLAIN)
+    codes, shape = a_code(decoder, 3), a_selection(len(points), 3)
+    through_selection = torch.autograd.grad(
+        decoder.field(codes).select(shape)(points).sum(), list(decoder.parameters())
+    )
+    through_forward = torch.autograd.grad(decoder(points, codes[shape]).sum(), list(decoder.parameters()))
+    torch.testing.assert_close(through_selection, through_forward)
+
+
+@pytest.mark.parametrize("recorded", [False, True])
+def test_chunks_of_a_selection_change_nothing(monkeypatch, points, recorded):
+    decoder = randomised(PLAIN)
+    field = decoder.field(a_code(decoder, 3)).select(a_selection(len(points), 3))
+    with torch.set_grad_enabled(recorded):
+        whole = field(points)
+        monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+        monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
+        torch.testing.assert_close(field(points), whole)
+
+
+def test_points_for_another_number_of_shapes_are_refused(points):
+    field = randomised(PLAIN).field(torch.zeros(3, 5))
+    with pytest.raises(
+        ValueError, match=r"^points of shape \[40, 3\] were given to a field of 3 shapes; give \[3, '...', 3\]$"
+    ):
+        field(points)
+    with pytest.raises(ValueError, match=r"^points of shape \[40, 3\] were given, but 2 shapes selected; give"):
+        field.select(torch.tensor([0, 1]))(points)
+    with pytest.raises(ValueError, match=r"^shapes -1 to 3 were selected; there are 3, counted from 0$"):
+        field.select(torch.tensor([0, 3, -1]))
+    with pytest.raises(ValueError, match=r"^points in torch.float32 were given to a decoder in torch.float64"):
+        field.select(torch.tensor([0, 1]))(points[:2].float())
+
+
+class Operations(TorchDispatchMode):
+    """Counts what PyTorch dispatches."""
+
+    count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.parametrize(("select", "most"), [(False, 24), (True, 28)])
+def test_without_derivatives_65_536_points_take_about_two_operations_a_layer(select, most):
+    decoder, points = randomised(ARCHITECTURES["as published"]), torch.zeros(1 << 16, 3, dtype=torch.float64)
+    field = decoder.field(a_code(decoder))
+    if select:
+        field = decoder.field(a_code(decoder, 3)).select(a_selection(len(points), 3))
+    with torch.no_grad(), Operations() as operations:
+        field(points)
+    assert operations.count <= most
+
+
+def test_without_derivatives_values_are_the_same(decoder, points):
+    field = decoder.field(a_code(decoder))
+    with torch.no_grad():
+        values = field(points)
+    assert not values.requires_grad
+    torch.testing.assert_close(values, field(points).detach())
+
+
+@pytest.mark.parametrize("count", [40, 39, 3])
+def test_values_stay_as_they_are_when_the_field_is_evaluated_again(decoder, points, count):
+    field = decoder.field(a_code(decoder))
+    with torch.no_grad():
+        first = field(points)
+        kept = first.clone()
+        field(points[:count] + 1.0)
+        assert torch.equal(first, kept)
+        assert torch.equal(field(points), kept)
+
+
+def test_threads_do_not_write_into_each_other_s_buffers(points):
+    decoder = randomised(ARCHITECTURES["as published"])
+    fields = [decoder.field(code) for code in a_code(decoder, 4)]
+    many = points.repeat(100, 1)
+    with torch.no_grad():
+        expected = [field(many) for field in fields]
+
+    def repeated(number: int) -> bool:
+        with torch.no_grad():
+            return all(torch.equal(fields[number](many), expected[number]) for _ in range(30))
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(repeated, range(4)))
+
+
+def test_modes_and_precisions_may_change_from_call_to_call(points):
+    decoder = randomised(PLAIN)
+    field, code = decoder.field(a_code(decoder)), a_code(decoder)
+    expected = field(points).detach()
+    with torch.inference_mode():
+        torch.testing.assert_close(decoder.field(code)(points.repeat(50, 1))[:40], expected)
+    with torch.no_grad():
+        torch.testing.assert_close(field(points), expected)
+        torch.testing.assert_close(torch.func.vmap(field)(points[:, None])[:, 0], expected)
+        torch.testing.assert_close(decoder.float().field(code)(points.float()).double(), expected, atol=1e-5, rtol=1e-5)
+
+
+def test_an_optimiser_s_step_is_seen_by_a_field_without_derivatives(points):
+    decoder = randomised(ARCHITECTURES["no norm"])
+    code = a_code(decoder)
+    field = decoder.field(code)
+    with torch.no_grad():
+        decoder.lin2.weight.mul_(2.0)
+        torch.testing.assert_close(field(points), decoder.field(code)(points))
+
+
 def test_a_code_of_another_length_is_named():
-    with pytest.raises(ValueError, match=r"^a code of shape \[4\] was given; this decoder takes \[5\]$"):
+    with pytest.raises(
+        ValueError,
+        match=r"^a code of shape \[4\] was given; this decoder takes \[5\]$",
+    ):
         Decoder(PLAIN).field(torch.zeros(4))
+    with pytest.raises(ValueError, match=r"^a code of shape \[2, 4\] was given; this decoder takes \[shapes, 5\]$"):
+        Decoder(PLAIN).field(torch.zeros(2, 4))
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,8 @@ ORDER = [
     *("threads", "errors", "files", "processes", "equality", "rays", "viewpoint", "camera", "pose"),
     *(
         "field",
+        "batch_field",
+        "products",
         "steepness",
         "primitives",
         "decoder",

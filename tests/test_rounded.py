@@ -63,9 +63,36 @@ def test_points_come_in_any_shape(model, form, shape: tuple[int, ...]) -> None:
 def test_several_shapes_are_answered_as_each_alone(model, form) -> None:
     rounded = form(model.decoder)
     points = torch.rand(300, 3, generator=torch.Generator().manual_seed(4)) - 0.5
-    asked = [(rounded.layers(code), part) for code, part in zip(model.codes, points.split([5, 200, 0, 95]))]
-    for answer, code, (_, part) in zip(rounded.run(asked), model.codes, asked):
+    counts = [5, 200, 0, 95]
+    field = rounded.field(model.codes[:4])
+    values = field.select(torch.arange(4).repeat_interleave(torch.tensor(counts)))(points)
+    for code, part, answer in zip(model.codes, points.split(counts), values.split(counts)):
         assert torch.equal(answer, rounded.field(code)(part))
+
+
+def test_a_batch_is_the_field_of_each_of_its_shapes(model, form) -> None:
+    rounded = form(model.decoder)
+    field, points = rounded.field(model.codes[:3]), torch.rand(3, 40, 2, 3, generator=torch.manual_seed(6)) - 0.5
+    assert len(field) == 3
+    assert torch.equal(field.codes, model.codes[:3])
+    for b, values in enumerate(field(points)):
+        torch.testing.assert_close(field[b](points[b]), values, atol=2e-3, rtol=0)
+        assert torch.equal(field[b](points[b]), rounded.field(model.codes[b])(points[b]))
+
+
+def test_more_points_of_several_shapes_than_a_chunk_are_as_good_as_few(model, form, monkeypatch) -> None:
+    field, points = (
+        form(model.decoder).field(model.codes[:2]),
+        torch.rand(2, 50, 3, generator=torch.manual_seed(7)) - 0.5,
+    )
+    whole = field(points)
+    monkeypatch.setattr("distrace.rounded.CHUNK", 32)
+    torch.testing.assert_close(field(points), whole, atol=2e-3, rtol=0)
+
+
+def test_a_batch_of_codes_of_another_length_is_refused(model, form) -> None:
+    with pytest.raises(ValueError, match=r"a code of shape \[3, 7\] was given; this decoder takes \[shapes, 256\]$"):
+        form(model.decoder).field(torch.zeros(3, 7))
 
 
 def test_laid_out_weights_give_what_autocast_gives(model) -> None:

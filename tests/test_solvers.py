@@ -7,6 +7,7 @@ import pytest
 import torch
 import trimesh
 
+from distrace.batch_field import BatchField
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.data.view import View
@@ -28,6 +29,9 @@ class Spheres(Decoder):
 
     def field(self, code: torch.Tensor):
         return lambda points: self(points, code)
+
+    def fields(self, codes: torch.Tensor) -> BatchField:
+        return BatchField(codes, lambda points, shape: self(points, codes[shape]), self.field)
 
 
 def steps(losses: list[float]) -> Iterator[Step]:

@@ -5,15 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 
+from distrace.batch_field import BatchField
 from distrace.camera import Camera
 from distrace.data.view import View
+from distrace.field import SDF
 from distrace.fitting.code_residuals import Comparison
 from distrace.fitting.seen import Seen
 from distrace.fitting.targets import Pool
-from distrace.fitting.verdict import MOST, contradiction
+from distrace.fitting.verdict import MOST, contradictions
 from distrace.losses import Weights
 from distrace.primitives import sphere
 from distrace.render import render
+from distrace.trace import TraceConfig
 
 CAMERA = Camera.orbit(30, 20, 3.0, height=48, width=48, focal_px=60.0)
 TRACE = Comparison().trace
@@ -25,6 +28,28 @@ def seen(depths: int = 500) -> Seen:
     view = View(CAMERA, buffers.depth, buffers.mask)
     pool = Pool.of(view.without("depth") if not depths else view)
     return Seen.of([pool.draw(depths, 3000, torch.Generator().manual_seed(0))], Weights())
+
+
+def contradiction(sdf: SDF, some: Seen, trace: TraceConfig) -> float:
+    """The verdict on a single shape."""
+    (verdict,) = contradictions(batch(sdf), some, trace)
+    return verdict
+
+
+def batch(*sdfs: SDF) -> BatchField:
+    """A field of several shapes in closed form."""
+
+    def evaluate(points: torch.Tensor, shape: torch.Tensor) -> torch.Tensor:
+        return torch.stack([sdf(points) for sdf in sdfs]).gather(0, shape[None])[0]
+
+    return BatchField(torch.zeros(len(sdfs), 1), evaluate, lambda code: sdfs[0])
+
+
+def test_several_shapes_are_judged_as_each_alone() -> None:
+    shapes = [sphere(radius) for radius in (0.5, 0.4, 0.6)]
+    expected = [contradiction(shape, seen(), TRACE) for shape in shapes]
+    assert contradictions(batch(*shapes), seen(), TRACE) == pytest.approx(expected)
+    assert len(set(expected)) == 3
 
 
 def test_what_was_seen_contradicts_nothing() -> None:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.batch_field import BatchField
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.errors import explained
 from distrace.experiment import read_weights, write_weights
@@ -35,8 +36,8 @@ class Model:
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "length"]) -> SDF:
-        """The signed distance field of a training code, or of any code.
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
+        """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
 
         Raises `ValueError` for a number or a length that the model has not.
         """

@@ -2,25 +2,26 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import weight_norm
 
-from distrace.field import SDF, chunked
+from distrace.batch_field import BatchField
+from distrace.field import SDF, flattened, in_chunks
+from distrace.products import Layer, Product, evaluated, joined, linear
 
 QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
 ROUND = 16  # widths that processors like
 SAMPLED = 8  # deviations are measured at every so many points
-CPU_CHUNK = 4096  # a layer's activations then stay in the cache: 20 µs a point, against 45 µs in batches of 250 K
+CPU_CHUNK = 1 << 16  # points evaluated at a time without derivatives …
+RECORDED_CHUNK = 4096  # … and with: a layer's fresh activations then stay in the cache
 GPU_CHUNK = 1 << 20
 FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond
-
-
-Layer = tuple[Tensor, Tensor]  # weight and bias
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,14 @@ class Decoder(nn.Module):
     def depth(self) -> int:
         return len(self.specs.dims) + 1
 
+    @property
+    def has_layer_norms(self) -> bool:
+        return bool(self.specs.norm_layers) and not self.specs.weight_norm
+
+    def is_fed(self, layer: int) -> bool:
+        """Whether points enter a layer, with or without the code."""
+        return layer == 0 or layer in self.specs.latent_in or self.specs.xyz_in_all
+
     def _outputs(self, widths: list[int], layer: int) -> int:
         if layer + 1 in self.specs.latent_in:
             return widths[layer + 1] - widths[0]
@@ -77,22 +86,36 @@ class Decoder(nn.Module):
         Under autocast points and code keep their precision: in bfloat16 a point at 0.8 would be off by up to 0.002.
         """
         with torch.autocast(points.device.type, enabled=False):
-            layers = self._folded(code)
+            layers = self.folded(code)
         return self._run(layers, points)
 
-    def field(self, code: Float[Tensor | np.ndarray, "length"]) -> "ShapeField":
-        """The signed distance field of one shape, the constant code folded into the biases of the layers it enters.
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField[ShapeField]":
+        """The signed distance field of one shape or, from codes [B, length], the field of B shapes.
 
-        In the decoder's precision, whatever the code's. Raises `ValueError` for a code of another length.
+        Constant codes are folded into the biases of the layers they enter. In the decoder's precision, whatever the
+        codes'. Raises `ValueError` for a code of another length.
         """
-        code = torch.as_tensor(code).to(next(self.parameters()))
-        if code.shape != (self.specs.code_length,):
-            takes = [self.specs.code_length]
-            raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
-        return ShapeField(self, self._folded(code), code)
+        code = self.checked(code)
+        return self.fields(code) if code.dim() == 2 else self._single(code)
 
-    def _folded(self, code: Tensor) -> list[Layer]:
-        """Each layer's weight without the code's columns, and its bias with what the code adds."""
+    def fields(self, codes: Float[Tensor | np.ndarray, "shapes length"]) -> "BatchField[ShapeField]":
+        """The field of several shapes, as `field` gives it."""
+        codes = self.checked(codes)
+        return BatchField(codes, Evaluation(self, self.folded(codes)), self._single)
+
+    def _single(self, code: Tensor) -> "ShapeField":
+        return ShapeField(self, self.folded(code), code)
+
+    def checked(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> Float[Tensor, "*shapes length"]:
+        """A code, or several, in the decoder's precision and on its device. Raises `ValueError` for another length."""
+        code, length = torch.as_tensor(code).to(next(self.parameters())), self.specs.code_length
+        if code.dim() not in (1, 2) or code.shape[-1] != length:
+            takes = f"[shapes, {length}]" if code.dim() == 2 else [length]
+            raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
+        return code
+
+    def folded(self, code: Float[Tensor, "*batch length"]) -> list[Layer]:
+        """Each layer's weight without the code's columns, and its bias with what the code adds: [*batch, outputs]."""
         layers, length = [], self.specs.code_length
         for layer in range(self.depth):
             linear = getattr(self, f"lin{layer}")
@@ -107,13 +130,15 @@ class Decoder(nn.Module):
     def _run(self, layers: list[Layer], points: Tensor, watch: Callable[[int, Tensor], None] | None = None) -> Tensor:
         x = points[..., :0]
         for layer, (weight, bias) in enumerate(layers):
-            fed = not layer or layer in self.specs.latent_in or self.specs.xyz_in_all
-            x = _joined(x, points, weight, bias) if fed else _linear(x, weight, bias)
+            x = joined(x, points, weight, bias) if self.is_fed(layer) else linear(x, weight, bias)
             if layer < self.depth - 1:
                 if watch:
                     watch(layer, x)
                 x = self._activated(x, layer)
-        x = x[..., 0]
+        return self.ended(x[..., 0])
+
+    def ended(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """The last layer's outputs, bent by tanh."""
         return torch.tanh(torch.tanh(x) if self.specs.use_tanh else x)
 
     def _activated(self, x: Tensor, layer: int) -> Tensor:
@@ -124,21 +149,45 @@ class Decoder(nn.Module):
         return x
 
 
+class Evaluation:
+    """Values at points, by layers that one code is folded into, or several: then `shape` numbers each point's shape."""
+
+    def __init__(self, decoder: Decoder, layers: list[Layer]) -> None:
+        self.decoder, self.layers = decoder, layers
+        self.products = [Product.of(layer, decoder.is_fed(number)) for number, layer in enumerate(layers)]
+
+    def __call__(self, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
+        """Raises `ValueError` for points of another precision than the decoder's."""
+        weight = self.layers[0][0]
+        if points.dtype != weight.dtype:
+            raise ValueError(
+                f"points in {points.dtype} were given to a decoder in {weight.dtype}; give a camera in that precision,"
+                " or change the decoder's by `.double()` or `.float()`"
+            )
+        on_cpu = weight.device.type == "cpu"
+        quick = on_cpu and not torch.is_grad_enabled() and not self.decoder.has_layer_norms
+        quick = quick and not self.decoder.training and not torch._C._are_functorch_transforms_active()
+        size = (CPU_CHUNK if quick else RECORDED_CHUNK) if on_cpu else GPU_CHUNK
+        return in_chunks(self._quick if quick else self._recorded, size, points, *([] if shape is None else [shape]))
+
+    def _quick(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
+        return self.decoder.ended(evaluated(self.products, points, shape))
+
+    def _recorded(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
+        """By operations that autograd, autocast and `torch.func` see through."""
+        layers = self.layers if shape is None else [(w, b if b.dim() == 1 else b[shape]) for w, b in self.layers]
+        return self.decoder._run(layers, points)
+
+
 class ShapeField:
     """The field of one shape: a decoder whose layers have the shape's code folded in, if it is known which."""
 
     def __init__(self, decoder: Decoder, layers: list[Layer], code: Float[Tensor, "length"] | None = None) -> None:
         self.decoder, self.layers, self.code = decoder, layers, code
-        self.size = CPU_CHUNK if layers[0][0].device.type == "cpu" else GPU_CHUNK
-        self.evaluate = chunked(lambda points: decoder._run(layers, points), self.size)
+        self.evaluate = Evaluation(decoder, layers)
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        if points.dtype != self.layers[0][0].dtype:
-            raise ValueError(
-                f"points in {points.dtype} were given to a decoder in {self.layers[0][0].dtype}; give a camera in that"
-                " precision, or change the decoder's by `.double()` or `.float()`"
-            )
-        return self.evaluate(points)
+        return flattened(self.evaluate, points)
 
     @torch.no_grad()
     def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
@@ -146,8 +195,8 @@ class ShapeField:
 
         Around the points it has the same values to rounding, at half the cost for an 8 × 512 decoder near its surface.
         """
-        specs, last = self.decoder.specs, len(self.layers) - 1
-        if not len(points) or (specs.norm_layers and not specs.weight_norm) or self.decoder.training:
+        last = len(self.layers) - 1
+        if not len(points) or self.decoder.has_layer_norms or self.decoder.training:
             return self(points), self  # a layer's norm is over all of its units
         highest = [torch.full_like(bias, -torch.inf) for _, bias in self.layers[:last]]
         deviation = [torch.zeros_like(bias) for _, bias in self.layers[:last]]
@@ -156,7 +205,7 @@ class ShapeField:
             highest[layer] = highest[layer].maximum(x.amax(0))
             deviation[layer] = deviation[layer].maximum(x[::SAMPLED].std(0, correction=0))
 
-        values = torch.cat([self.decoder._run(self.layers, part, watch) for part in points.split(self.size)])
+        values = in_chunks(partial(self.decoder._run, self.layers, watch=watch), RECORDED_CHUNK, points)
         kept = [_on(*both) for both in zip(highest, deviation, strict=True)]
         with torch.enable_grad():  # what surfaces are attached to is as differentiable as the whole
             return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
@@ -168,20 +217,6 @@ class ShapeField:
             fed = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)  # the points
             weight = weight[:, torch.cat([kept[layer - 1], fed])]
         return (weight[kept[layer]], bias[kept[layer]]) if layer < len(kept) else (weight.contiguous(), bias)
-
-
-def _linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A layer; its bias is one for all points, or one for each shape of a batch."""
-    return F.linear(x, weight, bias) if bias.dim() == 1 else F.linear(x, weight) + bias
-
-
-def _joined(units: Tensor, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
-    """A layer of units and points, the latter in full precision also under autocast."""
-    if not torch.is_autocast_enabled(points.device.type):
-        return _linear(torch.cat([units, points], dim=-1), weight, bias)
-    with torch.autocast(points.device.type, enabled=False):
-        placed = (F.linear(points, weight[:, -3:].to(points)) + bias).to(torch.get_autocast_dtype(points.device.type))
-    return F.linear(units, weight[:, :-3]) + placed if units.shape[-1] else placed
 
 
 def _on(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Tensor:

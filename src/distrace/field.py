@@ -4,7 +4,7 @@ import reprlib
 from collections.abc import Callable
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
@@ -60,6 +60,20 @@ def chunked(sdf: SDF, size: int) -> SDF:
     return field
 
 
+def flattened(
+    function: Callable[[Float[Tensor, "n 3"]], Float[Tensor, "n"]], points: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch"]:
+    """A function of points [n, 3], at points of any shape."""
+    return function(points) if points.dim() == 2 else function(points.reshape(-1, 3)).reshape(points.shape[:-1])
+
+
+def in_chunks(function: Callable[..., Tensor], size: int, *rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "n *_"]:
+    """A function of tensors of n rows, called with at most `size` rows of each at a time."""
+    if len(rows[0]) <= size:
+        return function(*rows)
+    return torch.cat([function(*part) for part in zip(*(each.split(size) for each in rows), strict=True)])
+
+
 def placed(sdf: SDF, T_world_object: Float[Tensor, "4 4"]) -> SDF:
     """The field of an object moved into the world by a similarity (rotation · scale, translation).
 
@@ -78,6 +92,15 @@ def narrowed(sdf: SDF, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"]
     """Values at points, and a field that is the same around them; cheaper, where the field has a way to be."""
     narrow = getattr(sdf, "narrowed", None)
     return narrow(points) if narrow else (asked(sdf, points), sdf)
+
+
+def at_rows(sdf: SDF, rows: Int[Tensor, "m"]) -> SDF:
+    """The field at some of the points that it was made for, by their numbers; most fields are made for any points.
+
+    A selection of shapes, `BatchField.select`, is made for points in an order.
+    """
+    some = getattr(sdf, "at_rows", None)
+    return some(rows) if some else sdf
 
 
 class Counted:

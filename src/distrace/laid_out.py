@@ -1,15 +1,15 @@
 """A plain decoder, of products, biases and ReLUs alone, as oneDNN multiplies fastest."""
 
-from collections.abc import Sequence
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from distrace.decoder import Decoder, Layer
-from distrace.rounded import ROWS, Asked, Rounded, filled
+from distrace.decoder import Decoder
+from distrace.products import Layer
+from distrace.rounded import ROWS, Rounded, filled
 
 PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
 
@@ -29,42 +29,34 @@ class LaidOut(Rounded):
         return not other and torch.backends.mkldnn.is_available() and hasattr(PRODUCTS, "_linear_pointwise")
 
     @torch.no_grad()
-    def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
-        """Those of the field of one shape; of the ones that are fed code and points, only what multiplies points."""
-        return [self._folded(*layer, code) if self._is_fed(k) else layer for k, layer in enumerate(self._layers)]
+    def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
+        """Those of a field; of the ones that code and points enter, only what multiplies points, transposed."""
+        code = self.decoder.checked(code)
+        return [self._folded(*layer, code) if self.decoder.is_fed(k) else layer for k, layer in enumerate(self._layers)]
 
     def _folded(self, weight: Tensor, bias: Tensor, code: Tensor) -> Layer:
-        return weight[:, -3:], F.linear(code, weight[:, -self._fed : -3], bias)
+        return weight[:, -3:].t(), F.linear(code, weight[:, -self._fed : -3], bias)
 
-    @torch.no_grad()
-    def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
-        """Values of several shapes, each at its points, by one product a layer."""
-        counts = torch.tensor([len(points) for _, points in asked])
-        whose = torch.eye(len(asked)).repeat_interleave(counts, 0)
-        rows = filled(torch.cat([torch.cat([points for _, points in asked]), whose], dim=1))
-        values = self._run_all([layers for layers, _ in asked], rows)[: len(whose)]
-        return list(values.float().split(counts.tolist()))
-
-    def _run_all(self, shapes: Sequence[list[Layer]], rows: Float[Tensor, "n inputs"]) -> Float[Tensor, "n"]:
-        """Of points, each beside a one for its shape and zeros for the others."""
-        x, last = _placed(rows, shapes, 0).relu_(), len(self._layers) - 1
+    def _run(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
+    ) -> Float[Tensor, "n"]:
+        x, last = _placed(layers[0], points, shape).relu_(), len(layers) - 1
         for number, weight in enumerate(self._weights, 1):
-            if self._is_fed(number):
-                x = _product(x, weight).add_(_placed(rows, shapes, number)).relu_()
+            if self.decoder.is_fed(number):
+                x = _product(x, weight).add_(_placed(layers[number], points, shape)).relu_()
             else:
-                x = _product(x, weight, self._layers[number][1], "relu" if number < last else "none")
-        x = x[:, 0]
-        return torch.tanh(torch.tanh(x) if self.decoder.specs.use_tanh else x)
+                x = _product(x, weight, layers[number][1], "relu" if number < last else "none")
+        return self.decoder.ended(x[:, 0])
 
     @torch.no_grad()
     def slopes(
         self, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
         """Exact values, and their derivatives by the point and by the code, rounded on the way back alone."""
-        layers, on, rows = self.decoder.field(code).layers, [], filled(points)
+        layers, on, rows = self.decoder.folded(self.decoder.checked(code)), [], filled(points)
         x = rows[:, :0]
         for number, layer in enumerate(layers):
-            x = F.linear(torch.cat([x, rows], dim=1) if self._is_fed(number) else x, *layer)
+            x = F.linear(torch.cat([x, rows], dim=1) if self.decoder.is_fed(number) else x, *layer)
             if number < len(layers) - 1:
                 on.append(x.relu_().sign().bfloat16())
         x, by_units = x[:, 0], layers[-1][0].expand(len(rows), -1)
@@ -87,7 +79,7 @@ class LaidOut(Rounded):
         """Weights, and biases in the precision that they are added in."""
         linears = [getattr(self.decoder, f"lin{layer}") for layer in range(self.decoder.depth)]
         layers = [(linear.weight.detach(), linear.bias.detach()) for linear in linears]
-        return [(w, b if self._is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
+        return [(w, b if self.decoder.is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
 
     @cached_property
     def _weights(self) -> list[Tensor]:
@@ -100,7 +92,8 @@ class LaidOut(Rounded):
         layers = range(self.decoder.depth - 1)
         units = [_laid_out(self._of_units(layer).T) if layer else None for layer in layers]
         fed = [
-            _laid_out(self._layers[layer][0][:, -self._fed :].T) if self._is_fed(layer) else None for layer in layers
+            _laid_out(self._layers[layer][0][:, -self._fed :].T) if self.decoder.is_fed(layer) else None
+            for layer in layers
         ]
         return list(zip(units, fed, strict=True))
 
@@ -111,7 +104,7 @@ class LaidOut(Rounded):
     def _of_units(self, layer: int) -> Tensor:
         """A layer's weights of the units before it."""
         weight = self._layers[layer][0]
-        return weight[:, : -self._fed] if self._is_fed(layer) else weight
+        return weight[:, : -self._fed] if self.decoder.is_fed(layer) else weight
 
 
 def _laid_out(weight: Tensor) -> Tensor:
@@ -122,7 +115,9 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, then: str = 
     return PRODUCTS._linear_pointwise(x, weight, bias, then, [], "")
 
 
-def _placed(rows: Float[Tensor, "n inputs"], shapes: Sequence[list[Layer]], number: int) -> Float[Tensor, "n width"]:
-    """What points, in full precision, and the codes that are folded into biases give to a layer that is fed them."""
-    weight, biases = shapes[0][number][0], [layers[number][1] for layers in shapes]
-    return F.linear(rows, torch.cat([weight, torch.stack(biases, dim=1)], dim=1)).bfloat16()
+def _placed(layer: Layer, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None) -> Float[Tensor, "n width"]:
+    """What points, and the codes that are folded into biases, give to a layer; computed in full precision."""
+    weight, bias = layer
+    if shape is None:
+        return torch.addmm(bias, points, weight).bfloat16()
+    return bias.index_select(0, shape).addmm_(points, weight).bfloat16()

@@ -1,19 +1,19 @@
 """A decoder's products in bfloat16: half the time where the processor has them, and as right as a fit can tell."""
 
-from collections.abc import Sequence
+from functools import partial
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
-from distrace.decoder import CPU_CHUNK, Decoder, Layer
-from distrace.field import SDF, chunked
+from distrace.batch_field import BatchField
+from distrace.decoder import Decoder
+from distrace.field import SDF, flattened, in_chunks
+from distrace.products import Layer
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
-
-Asked = tuple[list[Layer], Float[Tensor, "_ 3"]]
-"""A shape's layers, and points to have its values at."""
+CHUNK = 4096  # points at a time: each product's output is fresh memory; 65,536 at a time take twice as long
 
 
 class Rounded:
@@ -29,33 +29,49 @@ class Rounded:
         with torch.autocast(points.device.type, torch.bfloat16):
             return self.decoder(points, code).float()
 
-    def field(self, code: Float[Tensor, "length"]) -> SDF:
-        """The field of one shape, without derivatives by what it was made from."""
+    def field(self, code: Float[Tensor, "*shapes length"]) -> SDF | BatchField[SDF]:
+        """The field of one shape or, from codes [B, length], of B shapes; without derivatives.
+
+        Raises `ValueError` for a code of another length.
+        """
+        return self.fields(code) if code.dim() == 2 else self._single(code)
+
+    def fields(self, codes: Float[Tensor, "shapes length"]) -> BatchField[SDF]:
+        """The field of several shapes, as `field` gives it."""
+        layers = self.layers(codes)
+
+        def evaluate(points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+            return in_chunks(partial(self._values, layers), CHUNK, points, shape)
+
+        return BatchField(codes, evaluate, self._single)
+
+    def _single(self, code: Float[Tensor, "length"]) -> SDF:
         layers = self.layers(code)
 
-        @torch.no_grad()
         def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-            return self.run([(layers, points.reshape(-1, 3))])[0].reshape(points.shape[:-1])
+            return flattened(lambda flat: in_chunks(partial(self._values, layers), CHUNK, flat), points)
 
-        return chunked(evaluate, CPU_CHUNK)
-
-    @torch.no_grad()
-    def layers(self, code: Float[Tensor, "length"]) -> list[Layer]:
-        """Those of the field of one shape, rounded once, not at every product, but where points enter."""
-        layers = enumerate(self.decoder.field(code).layers)
-        return [(w if self._is_fed(number) else w.bfloat16(), b) for number, (w, b) in layers]
-
-    def _is_fed(self, layer: int) -> bool:
-        """Code and points, or points alone."""
-        specs = self.decoder.specs
-        return layer == 0 or layer in specs.latent_in or specs.xyz_in_all
+        return evaluate
 
     @torch.no_grad()
-    def run(self, asked: Sequence[Asked]) -> list[Float[Tensor, "_"]]:
-        """Values of several shapes, each at its points."""
-        return [self._run_one(layers, filled(points))[: len(points)].float() for layers, points in asked]
+    def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
+        """Those of a field, with biases [*shapes, outputs], in bfloat16, except those that points enter."""
+        layers = enumerate(self.decoder.folded(self.decoder.checked(code)))
+        return [(w if self.decoder.is_fed(number) else w.bfloat16(), b) for number, (w, b) in layers]
 
-    def _run_one(self, layers: list[Layer], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    @torch.no_grad()
+    def _values(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None
+    ) -> Float[Tensor, "n"]:
+        if shape is not None:
+            shape = pad(shape, (0, -len(shape) % ROWS))
+        return self._run(layers, filled(points), shape)[: len(points)].float()
+
+    def _run(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
+    ) -> Float[Tensor, "n"]:
+        if shape is not None:
+            layers = [(weight, bias if bias.dim() == 1 else bias[shape]) for weight, bias in layers]
         with torch.autocast(points.device.type, torch.bfloat16):
             return self.decoder._run(layers, points)
 

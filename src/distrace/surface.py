@@ -8,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from distrace.field import SDF, value_and_gradient
+from distrace.field import SDF, at_rows, value_and_gradient
 from distrace.rays import Bounds, Rays
 
 LEAST_SLOPE = 1e-6  # a ray along the surface has no derivative of its distance
@@ -159,12 +159,13 @@ def minimum_and_value(
             break
         ray, middle, w, lowest, highest = flat[going], t[going], width[going], near[going], far[going]
         before, after = (middle - w).maximum(lowest), (middle + w).minimum(highest)
-        left, right = sdf(ray.at(torch.stack([before, after])))
+        field = at_rows(sdf, going)
+        left, right = field(ray.at(torch.stack([before, after])))
         curvature = (left - 2 * value[going] + right).clamp_min(torch.finfo(t.dtype).tiny)
         offset = 0.5 * w * (left - right) / curvature
         vertex = (middle + offset.clamp(-w, w)).clamp(lowest, highest)
         candidates = torch.stack([middle, before, after, vertex])
-        values = torch.stack([value[going], left, right, sdf(ray.at(vertex))])
+        values = torch.stack([value[going], left, right, field(ray.at(vertex))])
         best = values.argmin(0, keepdim=True)
         t[going], value[going] = candidates.gather(0, best)[0], values.gather(0, best)[0]
         width[going] = torch.where(offset.abs() > w, w, w / 5)

@@ -4,13 +4,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.decoder import CPU_CHUNK, Decoder
+from distrace.decoder import RECORDED_CHUNK, Decoder
 from distrace.fitting.solver import Residuals
 from distrace.laid_out import LaidOut
 from distrace.rounded import Rounded
 
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
-PART = CPU_CHUNK // 2  # rows of a Jacobian that are made at once
+PART = RECORDED_CHUNK // 2  # rows of a Jacobian that are made at once
 
 
 def with_prior(

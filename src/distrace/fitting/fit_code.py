@@ -11,24 +11,28 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.batch_field import CountedBatch
 from distrace.data.view import View
 from distrace.decoder import FAR, Decoder
-from distrace.field import SDF, Counted
 from distrace.fitting.code_residuals import Problem
 from distrace.fitting.fit import pools_of
 from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.noise_level import noise_of
-from distrace.fitting.point_residuals import LOOKED, PointProblem, misfit
+from distrace.fitting.point_residuals import LOOKED, PointProblem, misfits
 from distrace.fitting.seen import Seen
-from distrace.fitting.side_by_side import Fields, Groups
 from distrace.fitting.solver import SolverConfig
-from distrace.fitting.staged import CodeFitConfig, ProblemOf, solved, stage_of
-from distrace.fitting.starts import Step, best_of, by_last_loss, decided, ended
+from distrace.fitting.staged import CodeFitConfig, ProblemOf, fitted, stage_of
+from distrace.fitting.starts import Step, best_of, by_last_loss, charged, decided
 from distrace.fitting.targets import drawn
-from distrace.fitting.verdict import contradiction
+from distrace.fitting.verdict import contradictions
 from distrace.prior import Prior
+from distrace.quickest import quickest
+from distrace.rounded import Rounded
 
-Verdict = Callable[[SDF, Step], float]
+Verdicts = Callable[[CountedBatch, Sequence[Step]], list[float]]
+"""Of the shapes of several steps, which have a field together."""
+Judge = Callable[[Sequence[Step]], list[Step]]
+"""From steps to those with a verdict, and with the time and the evaluations that this took."""
 
 
 def fit_code(
@@ -39,7 +43,7 @@ def fit_code(
     The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-    noises, fields = [noise_of(view) for view in views], Fields(decoder)
+    noises, quick = [noise_of(view) for view in views], quickest(decoder)
 
     def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
         targets = [pool.draw(depths, silhouette, random, touching) for pool in pools]
@@ -47,26 +51,27 @@ def fit_code(
 
     def problem(random: torch.Generator, share: float) -> Problem:
         some = seen(random, config.depth_rays, round(config.mask_rays * share))
-        return Problem(fields, prior, some, config.compared)
+        return Problem(quick, prior, some, config.compared)
 
     others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
 
-    def verdict(sdf: SDF, step: Step) -> float:
-        return contradiction(sdf, others, config.compared.trace)
+    def verdicts(field: CountedBatch, steps: Sequence[Step]) -> list[float]:
+        return contradictions(field, others, config.compared.trace)
 
     random = torch.Generator().manual_seed(config.seed)
     hints = Hints.of(seen(random, DEPTHS, SILHOUETTE), random)
     few = hints.depths < DEPTHS  # they hardly tell which training shapes are near
     config = config if few else replace(config, hops=0, sharpened=1)
-    steps = _best(fields, prior, hints, problem, config, verdict)
+    judge = partial(_judged, quick, verdicts)
+    steps = _best(quick, prior, hints, problem, config, judge)
     if not config.sharpening or not any(len(pool.between) for pool in pools):
         return steps
     random = torch.Generator().manual_seed(config.seed + 2)
     sharp = seen(random, config.depth_rays, config.mask_rays // 2, config.outline_rays)
-    return _then_sharpened(steps, Problem(fields, prior, sharp, config.compared, config.outlying), config, verdict)
+    return _then_sharpened(steps, Problem(quick, prior, sharp, config.compared, config.outlying), config, judge)
 
 
-def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, verdict: Verdict) -> Iterator[Step]:
+def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, judge: Judge) -> Iterator[Step]:
     """Steps, and from the best of their ends others that bring the surface to the outline; the best end comes last.
 
     From farther away such rays, which pull from both sides, lead to other ends more often than they help.
@@ -77,17 +82,11 @@ def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConf
         if isfinite(step.verdict):
             ends[step.start] = step
     best = sorted(ends.values(), key=lambda end: end.verdict)[: config.sharpened]
-    # each with a problem of its own: it counts its own evaluations
-    sharper = problem.fields.side_by_side([_sharpened(end, replace(problem), config) for end in best])
+    solver = SolverConfig(config.sharpening, even=True, scale=problem.scale, settled=0.0)
+    w, done = [problem.prior.coordinates(end.code) for end in best], [(end.start, end.iteration) for end in best]
+    sharper, _ = stage_of(problem, w, None, solver, [config.damping] * len(best), done)
     yield from chain.from_iterable(sharper)
-    last = [*best, *(fit[-1] for fit in sharper)]
-    yield decided([_judged(problem.fields, verdict, end) for end in last])
-
-
-def _sharpened(end: Step, problem: Problem, config: CodeFitConfig) -> Iterator[Step]:
-    solver = SolverConfig(config.sharpening, config.damping, even=True, scale=problem.scale, settled=0.0)
-    steps = stage_of(problem, problem.prior.coordinates(end.code), None, solver, end.start, end.iteration)
-    return (step for step, _ in steps)
+    yield decided(judge([*best, *(fit[-1] for fit in sharper)]))
 
 
 def fit_points(
@@ -107,52 +106,71 @@ def fit_points(
         count = config.depth_rays + round(config.mask_rays * share)
         return PointProblem(decoder, prior, samples, count, random, weights)
 
-    def verdict(sdf: SDF, step: Step) -> float:
-        return weights.depth * misfit(sdf, others) + step.terms["code"]
+    def verdicts(field: CountedBatch, steps: Sequence[Step]) -> list[float]:
+        found = misfits(field, others)
+        return [weights.depth * misfit + step.terms["code"] for misfit, step in zip(found, steps, strict=True)]
 
     random, weights = torch.Generator().manual_seed(config.seed), config.compared.weights
     near = samples[samples[:, 3].abs() < FAR]
     some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
     others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    return _best(
-        Fields(decoder), prior, Hints(some[:, :3], some[:, 3]), problem, replace(config, more=0, hops=0), verdict
-    )
+    hints, quick = Hints(some[:, :3], some[:, 3]), quickest(decoder)
+    return _best(quick, prior, hints, problem, replace(config, more=0, hops=0), partial(_judged, quick, verdicts))
 
 
 def _best(
-    fields: Fields,
+    decoder: Decoder | Rounded,
     prior: Prior,
     hints: Hints,
     problem_of: ProblemOf,
     config: CodeFitConfig,
-    verdict: Verdict,
+    judge: Judge,
 ) -> Iterator[Step]:
     """From all starts; the first step is charged with the search for them. The least verdict's end is the best.
 
-    While none fits it hops from the best one and looks at other rays (basin hopping: Wales and Doye,
-    *J. Phys. Chem. A* 1997).
+    The first starts are fitted together, and so are those that follow while none fits. Then each hops from the best
+    one and looks at other rays (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
     """
-    first, judge = first_of(fields.quick, prior, hints, config.apart, config.seed), partial(_judged, fields, verdict)
+    first = first_of(decoder, prior, hints, config.apart, config.seed)
+    fits: dict[int, list[Step]] = {}
+    wanted: set[int] = set()
 
-    def fit(start: int) -> Iterator[Step]:
-        return ended(solved(problem_of, prior, config, start, first.coordinates[start]), judge)
+    def fit(starts: range, w: Sequence[Float[Tensor, "dimensions"]], seed: int) -> None:
+        steps = fitted(problem_of, prior, replace(config, seed=seed), w, starts[0])
+        judged = judge([each[-1] for each in steps])
+        for start, each, end in zip(starts, steps, judged, strict=True):
+            fits[start] = [*each[:-1], charged(end, [each[-1]])]
+
+    def run(start: int) -> Iterator[Step]:
+        if start not in fits:
+            group = range(config.starts) if start < config.starts else range(config.starts, config.apart)
+            fit(group, first.coordinates[group[0] : group[-1] + 1], config.seed)
+        wanted.add(start)
+        return iter(fits[start])
 
     def hop(start: int, best: Step) -> Iterator[Step]:
-        other = replace(config, seed=config.seed + start)
-        away = prior.draw(torch.Generator().manual_seed(other.seed), config.hop)
-        return ended(solved(problem_of, prior, other, start, prior.coordinates(best.code) + away), judge)
+        seed = config.seed + start
+        away = prior.draw(torch.Generator().manual_seed(seed), config.hop)
+        fit(range(start, start + 1), [prior.coordinates(best.code) + away], seed)
+        return run(start)
 
-    groups = Groups(fields, fit, [range(config.starts), range(config.starts, config.apart)])
-    steps = ended(best_of(config, groups.steps, by_last_loss, judge, hop), groups.charge)
+    steps = best_of(config, run, by_last_loss, lambda step: judge([step])[0], hop)
     step = next(steps)
-    yield replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
-    yield from steps
+    step = replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
+    for following in steps:
+        yield step
+        step = following
+    yield charged(step, [each for start, in_vain in fits.items() if start not in wanted for each in in_vain])
 
 
-def _judged(fields: Fields, verdict: Verdict, step: Step) -> Step:
-    """A step with the verdict on its shape, and what that took: nothing, where it has one."""
-    if isfinite(step.verdict):
-        return replace(step, seconds=0.0, evaluations=0)
-    began, sdf = time.perf_counter(), Counted(fields.field(step.code))
-    judged = replace(step, verdict=verdict(sdf, step))
-    return replace(judged, seconds=time.perf_counter() - began, evaluations=sdf.evaluations)
+def _judged(decoder: Decoder | Rounded, verdicts: Verdicts, steps: Sequence[Step]) -> list[Step]:
+    """Steps with the verdicts on their shapes, and what those took: nothing, for a step that has one."""
+    began, new = time.perf_counter(), [step for step in steps if not isfinite(step.verdict)]
+    if not new:
+        return [replace(step, seconds=0.0, evaluations=0) for step in steps]
+    field = CountedBatch(decoder.fields(torch.stack([step.code for step in new])))
+    found = verdicts(field, new)
+    seconds = (time.perf_counter() - began) / len(new)
+    each = zip(new, found, field.evaluations, strict=True)
+    judged = {id(step): replace(step, verdict=v, seconds=seconds, evaluations=spent) for step, v, spent in each}
+    return [judged.get(id(step)) or replace(step, seconds=0.0, evaluations=0) for step in steps]

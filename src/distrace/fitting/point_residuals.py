@@ -1,13 +1,15 @@
 """What the shape of a code lacks of points whose distances are known, and its exact derivatives by the code."""
 
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from distrace.batch_field import BatchField
 from distrace.decoder import FAR, Decoder
-from distrace.field import SDF
 from distrace.fitting.by_code import derivatives, with_prior
 from distrace.fitting.solver import Residuals
 from distrace.fitting.targets import drawn
@@ -19,15 +21,16 @@ LOOKED = 20_000  # points at most that are asked whether they say something
 
 @dataclass(frozen=True)
 class Told:
-    """Coordinates of a code, and the points that its shape is compared at."""
+    """One start's coordinates of a code, and the points that its shape is compared at."""
 
+    start: int  # its number among the starts that are fitted together
     w: Float[Tensor, "dimensions"]
     samples: Float[Tensor, "n 4"]
 
 
 @dataclass
 class PointProblem:
-    """Residuals f(p) − d of a code's coordinates at points; surface points have d = 0.
+    """Residuals f(p) − d of the coordinates of several codes, each a start, at points; surface points have d = 0.
 
     What is farther than `FAR`, on the right side, is right. A look finds points that are not: most of those far from
     the surface say nothing, but a surface where none should be is known from them alone.
@@ -40,24 +43,32 @@ class PointProblem:
     random: torch.Generator
     counted: Weights
     scale: float = 0.02  # up to which deviations count by their squares
-    evaluations: int = 0
+    evaluations: Counter[int] = field(default_factory=Counter)  # of the field, by each start
 
     @torch.no_grad()
-    def look(self, w: Float[Tensor, "dimensions"], last: Told | None = None) -> Told:
-        """Draws points that say something of this shape."""
+    def look(self, w: Sequence[Float[Tensor, "dimensions"]], last: Sequence[Told] | None = None) -> list[Told]:
+        """Draws points that say something of each shape: the same draw for all starts, as if each were alone."""
         some = drawn(self.samples, LOOKED, self.random)
-        self.evaluations += len(some)
-        values = self.decoder.field(self.prior.code(w))(some[:, :3])
-        telling = some[~_right(values, some[:, 3])]
-        return Told(w, drawn(telling if len(telling) else some, self.count, self.random))
+        self.evaluations.update({start: len(some) for start in range(len(w))})
+        field = self.decoder.fields(torch.stack([self.prior.code(each) for each in w]))
+        seed = int(torch.randint(1 << 62, (), generator=self.random))
+        found = []
+        for start, values in enumerate(field(some[:, :3].expand(len(w), -1, -1))):
+            telling = some[~_right(values, some[:, 3])]
+            random = torch.Generator().manual_seed(seed)
+            found.append(Told(start, w[start], drawn(telling if len(telling) else some, self.count, random)))
+        return found
 
-    def moved(self, at: Told, step: Float[Tensor, "dimensions"]) -> Told:
-        return Told(at.w + step, at.samples)
+    def moved(self, told: Sequence[Told], steps: Sequence[Float[Tensor, "dimensions"]]) -> list[Told]:
+        return [Told(at.start, at.w + step, at.samples) for at, step in zip(told, steps, strict=True)]
 
-    def residuals(self, at: Told) -> Residuals:
+    def residuals(self, told: Sequence[Told]) -> list[Residuals]:
+        return [self._residuals(at) for at in told]  # a start has enough points for one product
+
+    def _residuals(self, at: Told) -> Residuals:
         points, distances = at.samples[:, :3], at.samples[:, 3]
         values, _, by_code = derivatives(self.decoder, points, self.prior.code(at.w))
-        self.evaluations += len(values)
+        self.evaluations[at.start] += len(values)
         right = _right(values, distances)
         lacking = (values - distances).masked_fill(right, 0.0)
         jacobian = (by_code @ self.prior.basis).masked_fill(right[:, None], 0.0)
@@ -73,11 +84,10 @@ class PointProblem:
 
 
 @torch.no_grad()
-def misfit(sdf: SDF, samples: Float[Tensor, "n 4"]) -> float:
-    """How far a field is from the distances at points, in the mean, beyond `FAR` not at all."""
-    values, distances = sdf(samples[:, :3]), samples[:, 3]
-    apart = (values.clamp(-FAR, FAR) - distances.clamp(-FAR, FAR)).abs()
-    return float(apart.mean())
+def misfits(field: BatchField, samples: Float[Tensor, "n 4"]) -> list[float]:
+    """How far each shape is from the distances at points, in the mean, beyond `FAR` not at all."""
+    values, distances = field(samples[:, :3].expand(len(field), -1, -1)), samples[:, 3]
+    return (values.clamp(-FAR, FAR) - distances.clamp(-FAR, FAR)).abs().mean(1).tolist()
 
 
 def _right(values: Float[Tensor, "n"], distances: Float[Tensor, "n"]) -> Bool[Tensor, "n"]:

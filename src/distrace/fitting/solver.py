@@ -4,7 +4,7 @@ Marquardt, SIAM J. 1963; damping as in Madsen, Nielsen and Tingleff, *Methods fo
 """
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Generic, TypeVar
 
@@ -82,6 +82,44 @@ class Residuals:
         return step.to(self.values), float(step @ (damped * step - slope)) / 2
 
 
+@dataclass
+class Descent(Generic[State]):
+    """The way down from one start: the best state so far, and how the next step is damped."""
+
+    state: State
+    residuals: Residuals
+    damping: float
+    growth: float = 2.0  # of the damping, at the next step that is rejected
+    accepted: bool = False
+    settled: bool = False  # no further step lowers the loss
+
+
+def descend(
+    descents: Sequence[Descent[State]],
+    residuals: Callable[[Sequence[State]], Sequence[Residuals]],
+    moved: Callable[[Sequence[State], Sequence[Float[Tensor, "unknowns"]]], Sequence[State]],
+    config: SolverConfig,
+    iteration: int,
+) -> None:
+    """One iteration of several starts, each with its own damping, whose states are moved and evaluated together."""
+    scale, kernel = config.scale_at(iteration), config.kernel
+    steps = [each.residuals.step(scale, each.damping, kernel, config.even) for each in descents]
+    candidates = moved([descent.state for descent in descents], [step for step, _ in steps])
+    tried = zip(descents, steps, candidates, residuals(candidates), strict=True)
+    for descent, (step, expected), candidate, then in tried:
+        before, after = descent.residuals.loss(scale, kernel), then.loss(scale, kernel)
+        descent.accepted = after < before
+        if descent.accepted:
+            gain = (before - after) / max(expected, 1e-30)
+            descent.damping = max(descent.damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING)
+            descent.growth, descent.state, descent.residuals = 2.0, candidate, then
+        else:
+            descent.damping = min(descent.damping * descent.growth, LARGEST_DAMPING)
+            descent.growth *= 2
+        little = step.norm() <= config.settled or abs(before - after) <= config.settled * before
+        descent.settled = bool(little) and scale == config.scale_at(config.iterations)
+
+
 @dataclass(frozen=True)
 class Solution(Generic[State]):
     """Where an iteration stands: the best state so far, and its loss at the scale of the end."""
@@ -102,23 +140,12 @@ def minimise(
     config: SolverConfig = SolverConfig(),
 ) -> Iterator[Solution[State]]:
     """Moves a state along the unknowns' steps until its residuals vanish, or no step lowers the loss."""
-    state, damping, growth = start, config.damping, 2.0
-    now = residuals(state)
+    descent = Descent(start, residuals(start), config.damping)
     for iteration in range(config.iterations):
-        began, scale = time.perf_counter(), config.scale_at(iteration)
-        step, expected = now.step(scale, damping, config.kernel, config.even)
-        candidate = moved(state, step)
-        then = residuals(candidate)
-        before, after = now.loss(scale, config.kernel), then.loss(scale, config.kernel)
-        accepted = after < before
-        if accepted:
-            gain = (before - after) / max(expected, 1e-30)
-            damping, growth = max(damping * max(1 / 4, 1 - (2 * gain - 1) ** 3), LEAST_DAMPING), 2.0
-            state, now = candidate, then
-        else:
-            damping, growth = min(damping * growth, LARGEST_DAMPING), 2 * growth
-        seconds = time.perf_counter() - began
-        yield Solution(iteration + 1, state, now.loss(config.scale, config.kernel), damping, accepted, seconds, now)
-        little = step.norm() <= config.settled or abs(before - after) <= config.settled * before
-        if little and scale == config.scale_at(config.iterations):
+        began = time.perf_counter()
+        descend([descent], lambda states: [residuals(states[0])], lambda x, by: [moved(x[0], by[0])], config, iteration)
+        seconds, now = time.perf_counter() - began, descent.residuals
+        loss = now.loss(config.scale, config.kernel)
+        yield Solution(iteration + 1, descent.state, loss, descent.damping, descent.accepted, seconds, now)
+        if descent.settled:
             return

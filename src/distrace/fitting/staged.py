@@ -1,7 +1,8 @@
-"""A fit of a code from one start, in stages: what is far off pulls at first, and hardly in the end."""
+"""Fits of a code from several starts at once, in stages: what is far off pulls at first, and hardly in the end."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from distrace.fitting.code_residuals import Comparison, Problem
 from distrace.fitting.point_residuals import PointProblem
-from distrace.fitting.solver import Kernel, Solution, SolverConfig, cauchy, charbonnier, minimise
+from distrace.fitting.solver import Descent, Kernel, SolverConfig, cauchy, charbonnier, descend
 from distrace.fitting.starts import Starts, Step, stages_of
 from distrace.losses import Weights
 from distrace.prior import Prior
@@ -64,31 +65,57 @@ class CodeFitConfig(Starts):
         return self.scale * self.narrowing**stage, charbonnier
 
 
-def solved(
-    problem_of: ProblemOf, prior: Prior, config: CodeFitConfig, start: int, w: Float[Tensor, "dimensions"]
-) -> Iterator[Step]:
-    """From one start, on the rays or points that the seed tells."""
-    done, damping, random = 0, config.damping, torch.Generator().manual_seed(config.seed)
+def fitted(
+    problem_of: ProblemOf, prior: Prior, config: CodeFitConfig, w: Sequence[Float[Tensor, "dimensions"]], first: int = 0
+) -> list[list[Step]]:
+    """All steps of fits from several starts `w`, numbered from `first`, on the rays or points that the seed tells.
+
+    Each ends where it would end alone; the network is evaluated for all of them together.
+    """
+    steps: list[list[Step]] = [[] for _ in w]
+    random, damping = torch.Generator().manual_seed(config.seed), [config.damping] * len(w)
     problem: Any = None
-    state: Any = None
+    last: Any = None
     for stage, length in stages_of(config.iterations, config.stages):
         if problem is None or stage < 2:
-            problem, state = problem_of(random, 1.0 if stage else config.first_share), None
+            problem, last = problem_of(random, 1.0 if stage else config.first_share), None
         problem.scale, kernel = config.scale_and_kernel(stage)
-        solver = SolverConfig(length, damping, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
-        for step, solution in stage_of(problem, w, state, solver, start, done):
-            yield step
-            done, damping, state, w = step.iteration, solution.damping, solution.state, solution.state.w
+        solver = SolverConfig(length, even=True, scale=problem.scale, kernel=kernel, settled=0.0)
+        done = [(first + k, len(before)) for k, before in enumerate(steps)]
+        more, descents = stage_of(problem, w, last, solver, damping, done)
+        steps = [before + after for before, after in zip(steps, more, strict=True)]
+        last, damping = [each.state for each in descents], [each.damping for each in descents]
+        w = [state.w for state in last]
+    return steps
 
 
 def stage_of(
-    problem: Any, w: Float[Tensor, "dimensions"], last: Any, solver: SolverConfig, start: int, done: int
-) -> Iterator[tuple[Step, Solution]]:
-    """A look at all that is compared, and steps from there; the first is charged with the look."""
-    began, asked = time.perf_counter(), problem.evaluations
-    for solution in minimise(problem.residuals, problem.look(w, last), problem.moved, solver):
-        done, state = done + 1, solution.state
-        terms, code = problem.terms(state, solution.residuals), problem.prior.code(state.w)
-        seconds, evaluations = time.perf_counter() - began, problem.evaluations - asked
-        yield Step(start, done, sum(terms.values()), terms, code, seconds, evaluations), solution
-        began, asked = time.perf_counter(), problem.evaluations
+    problem: Any,
+    w: Sequence[Float[Tensor, "dimensions"]],
+    last: Any,
+    solver: SolverConfig,
+    damping: Sequence[float],
+    done: Sequence[tuple[int, int]],
+) -> tuple[list[list[Step]], list[Descent]]:
+    """Looks along all rays, and steps from there, of several starts: their steps, and where they end.
+
+    `done`: each start's number, and how many steps it has had. The first step is charged with the look. Time is shared
+    out evenly; a start that has settled takes no further part.
+    """
+    began, evaluations = time.perf_counter(), Counter(problem.evaluations)
+    looks = problem.look(w, last)
+    descents = [Descent(*each) for each in zip(looks, problem.residuals(looks), damping, strict=True)]
+    steps: list[list[Step]] = [[] for _ in w]
+    for iteration in range(solver.iterations):
+        going = [k for k, descent in enumerate(descents) if not descent.settled]
+        if not going:
+            break
+        descend([descents[k] for k in going], problem.residuals, problem.moved, solver, iteration)
+        seconds, began = (time.perf_counter() - began) / len(going), time.perf_counter()
+        spent, evaluations = problem.evaluations - evaluations, Counter(problem.evaluations)
+        for k in going:
+            (start, before), state = done[k], descents[k].state
+            terms, code = problem.terms(state, descents[k].residuals), problem.prior.code(state.w)
+            number = before + len(steps[k]) + 1
+            steps[k].append(Step(start, number, sum(terms.values()), terms, code, seconds, spent[k]))
+    return steps, descents

@@ -1,6 +1,6 @@
 """Fitting from several starts, because a loss has many valleys: all are tried, the best go on to their ends."""
 
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice, pairwise
 from math import inf
@@ -147,26 +147,11 @@ def best_of(
         best = _best(verdicts)
         if best.verdict <= starts.doubtful:
             break
-        verdicts.append(judge((yield from passed(hop(start, best) if hop and start >= starts.apart else run(start)))))
+        end = best
+        for end in hop(start, best) if hop and start >= starts.apart else run(start):
+            yield end
+        verdicts.append(judge(end))
     yield decided(verdicts, compared)
-
-
-def passed(steps: Iterator[Stepped]) -> Generator[Stepped, None, Stepped]:
-    """All of them; the last one is returned, too."""
-    step = next(steps)
-    yield step
-    for step in steps:
-        yield step
-    return step
-
-
-def ended(steps: Iterator[Stepped], judge: Judge[Stepped]) -> Iterator[Stepped]:
-    """All of them, the last one judged and charged with that."""
-    step = next(steps)
-    for following in steps:
-        yield step
-        step = following
-    yield charged(judge(step), [step])
 
 
 def decided(ends: Sequence[Stepped], compared: Sequence[Stepped] = ()) -> Stepped:
