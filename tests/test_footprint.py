@@ -85,10 +85,10 @@ def test_many_points_in_parts_have_the_gradient_of_all_at_once(monkeypatch: pyte
     torch.testing.assert_close(*slopes)
 
 
-@pytest.mark.parametrize("width", [torch.full((49,), 0.1), torch.tensor(0.1), torch.zeros(50)])
-def test_widths_that_are_none_are_refused(width: Tensor) -> None:
-    with pytest.raises(ValueError, match="one positive width for each point"):
-        surface.footprint_normals(primitives.sphere(0.5), on_sphere(), width.to(f64))
+@pytest.mark.parametrize("width", [0.0, -0.1, float("nan")])
+def test_widths_that_are_none_are_refused(width: float) -> None:
+    with pytest.raises(ValueError, match=f"a width of {width}"):
+        surface.footprint_normals(primitives.sphere(0.5), on_sphere(), torch.full((50,), width, dtype=f64))
 
 
 def test_the_image_is_zero_on_the_background_and_made_once() -> None:
@@ -117,7 +117,7 @@ def test_one_more_image_costs_32_evaluations_a_hit() -> None:
     assert buffers.points.any()
     before = counted.evaluations
     assert buffers.footprint_normal.any()
-    assert counted.evaluations - before == 32 * int(buffers.mask.sum())
+    assert counted.evaluations - before == 32 * int(buffers.mask.sum()) + 1, "one tells whether the field has a graph"
 
 
 @pytest.fixture(scope="module")
@@ -149,25 +149,25 @@ def test_a_loss_on_a_decoders_normals_falls_along_its_gradient(decoder: tuple[De
     assert after < 0.97 * loss.item(), "a tenth of it, to first order"
 
 
-def test_shading_a_decoder_has_a_gradient_of_its_normals_and_keeps_exact_values(
-    decoder: tuple[Decoder, Tensor],
-) -> None:
-    network, start = decoder
-    code = start.clone().requires_grad_()
-    buffers = seen(network, code)
-    image = shade(buffers, lambert, torch.zeros(1))
-    assert (image[buffers.mask][:, 0] == (buffers.normal[buffers.mask] @ LIGHT).clamp_min(0)).all()
-    inside = buffers.mask & ~edges(buffers.mask)
-    (slope,) = torch.autograd.grad(image[inside].square().sum(), code)
-    lit = (buffers.footprint_normal @ LIGHT).clamp_min(0)
-    (expected,) = torch.autograd.grad(lit[inside].square().sum(), code)
-    assert torch.cosine_similarity(slope, expected, dim=0) > 0.8
+def test_shading_a_decoder_keeps_exact_values_and_its_gradient_follows_differences() -> None:
+    """Outlines and exact normals alone give a slope of the other sign here."""
+    model = load_model("chairs")
+    start, along = model.codes[200], model.codes[11] - model.codes[200]
 
+    def mean(h: Tensor, size: int) -> Tensor:
+        camera = Camera.orbit(30, 20, 2.6, height=size, width=size, focal_mm=30)
+        buffers = render(model.field(start + h * along), camera)
+        image = shade(buffers, lambert, torch.zeros(1))
+        lit = (buffers.normal[buffers.mask] @ LIGHT).clamp_min(0)
+        assert torch.equal(image[buffers.mask][:, 0], lit)
+        across = torch.linspace(0, 1, size)
+        return (image[..., 0] * (3 * across[None] ** 2 + 0.7 * across[:, None])).mean()
 
-def edges(mask: Tensor) -> Tensor:
-    """Pixels beside the background."""
-    around = torch.nn.functional.max_pool2d((~mask).float()[None], 3, 1, 1)[0]
-    return around > 0
+    h = torch.zeros((), requires_grad=True)
+    (slope,) = torch.autograd.grad(mean(h, 64), h)
+    with torch.no_grad():
+        before, after = (mean(torch.tensor(step), 320) for step in (-0.05, 0.05))
+    assert slope.item() == pytest.approx(float(after - before) / 0.1, rel=0.3)
 
 
 def test_colours_without_normals_and_smooth_fields_do_not_pay_for_footprints(
@@ -188,12 +188,12 @@ def test_colours_without_normals_and_smooth_fields_do_not_pay_for_footprints(
 
 def test_a_second_backward_pass_of_one_rendering_says_what_to_do(decoder: tuple[Decoder, Tensor]) -> None:
     network, start = decoder
-    for image in ("normal", "points", "footprint_normal"):
+    for image in ("depth", "normal", "points", "footprint_normal"):
         code = start.clone().requires_grad_()
         buffers = seen(network, code, 12)
         buffers.depth[buffers.mask].sum().backward()
         with pytest.raises(RuntimeError, match="add up the losses"):
-            getattr(buffers, image).sum().backward()
+            getattr(buffers, image)[0].sum().backward()
 
 
 def test_with_a_kept_graph_or_as_a_sum_two_losses_have_both_gradients() -> None:

@@ -27,21 +27,8 @@ Image = Callable[["Buffers"], Tensor]
 STRATEGIES: dict[str, Config] = {**MARCHES, "fast": FastConfig()}
 
 
-def _kept(image: Image) -> property:
-    """Makes an image when it is first asked for; once with its gradients, and once without where grad mode is off."""
-
-    @wraps(image)
-    def read(buffers: "Buffers") -> Tensor:
-        key = image.__name__, torch.is_grad_enabled()
-        if key not in buffers.images:
-            buffers.images[key] = image(buffers)
-        return buffers.images[key]
-
-    return property(read)
-
-
 class _Shared(torch.autograd.Function):
-    """The identity for a tensor that several images share; it explains why a second backward pass fails."""
+    """The identity, for an image that others are made from; it explains why a second backward pass fails."""
 
     @staticmethod
     def forward(ctx: Any, shared: Tensor) -> Tensor:
@@ -58,6 +45,20 @@ class _Shared(torch.autograd.Function):
                 " call backward once, or pass retain_graph=True to every backward but the last"
             ) from error
         return slope
+
+
+def _kept(image: Image) -> property:
+    """Makes an image when it is first asked for; once with its gradients, and once without where grad mode is off."""
+
+    @wraps(image)
+    def read(buffers: "Buffers") -> Tensor:
+        key = image.__name__, torch.is_grad_enabled()
+        if key not in buffers.images:
+            made = image(buffers)
+            buffers.images[key] = _Shared.apply(made) if made.requires_grad else made
+        return buffers.images[key]
+
+    return property(read)
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ class Buffers:
         if not torch.is_grad_enabled():
             return self.trace.distance
         attached = surface.attach(self.near, self.rays[hit], self.trace.distance[hit])
-        return _Shared.apply(self.trace.distance.masked_scatter(hit, attached))
+        return self.trace.distance.masked_scatter(hit, attached)
 
     @_kept
     def depth(self) -> Float[Tensor, "*batch"]:

@@ -75,13 +75,11 @@ def footprint_normals(
     network is constant in each linear piece, so its derivative is zero; differences between pieces change with the
     field, the points and the width. The derivative is a first one. Costs 32 evaluations a point.
 
-    Raises `ValueError` for widths that are not one positive number for each point.
+    Raises `ValueError` for a width that is not positive.
     """
-    if width.shape != points.shape[:-1] or not (width > 0).all():
-        raise ValueError(
-            f"widths of shape {list(width.shape)} were given for points of shape {list(points.shape)}; give one"
-            " positive width for each point"
-        )
+    if not (width > 0).all():
+        wrong = float(width.detach()[~(width > 0)][0])
+        raise ValueError(f"a width of {wrong} was given for the footprint of a point; widths must be positive")
     around = directions_of_taps(points)
     taps = points[..., None, :] + width[..., None, None] / 2 * around
     with torch.set_grad_enabled(_differentiable(sdf, taps)):
