@@ -111,6 +111,14 @@ def test_footprints_are_some_pixels_wide_and_in_coarse_images_a_part_of_the_radi
         assert buffers.footprint_widths.item() == pytest.approx(width, rel=1e-3)
 
 
+def test_cameras_in_a_batch_have_the_footprints_of_each() -> None:
+    box, cameras = primitives.box(torch.tensor([0.5, 0.3, 0.4], dtype=f64)), [view(40), view(40).turned(50)]
+    matrices = (torch.stack([getattr(c, name) for c in cameras]) for name in ("intrinsics", "T_world_camera"))
+    together = render(box, Camera.from_matrices(*matrices, 40, 40)).footprint_normal
+    for k, camera in enumerate(cameras):
+        torch.testing.assert_close(together[k], render(box, camera).footprint_normal, rtol=0, atol=1e-9)
+
+
 def test_one_more_image_costs_32_evaluations_a_hit() -> None:
     counted = Counted(primitives.sphere(0.5))
     buffers = render(counted, view())
