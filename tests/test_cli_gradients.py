@@ -50,7 +50,9 @@ def facts(out: Path) -> dict:
 
 
 def only_hits(found: GradientCheck) -> GradientCheck:
-    return replace(found, rows=tuple(row for row in found.rows if row.quantity != "clearance"))
+    """Without what a network of 16 units a layer is too coarse for: its pieces are as large as a footprint."""
+    coarse = ("clearance", "footprint normal")
+    return replace(found, rows=tuple(row for row in found.rows if row.quantity not in coarse))
 
 
 def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
@@ -65,9 +67,13 @@ def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
     assert content["agrees"] is True
     assert {row["parameter"] for row in content["rows"]} >= {"code", "weights", "placement", "focal length"}
     keys = {"model", "quantity", "parameter", "median", "worst", "x", "y", "along", "derivative", "difference"}
-    assert all(keys | {"pixels", "off", "left_out", "agrees"} <= set(row) for row in content["rows"])
+    assert all(keys | {"pixels", "off", "left_out", "verdict", "step"} <= set(row) for row in content["rows"])
     said = capsys.readouterr().out
-    assert f"{len(content['rows'])} of {len(content['rows'])} agree" in said
+    zeros = [row for row in content["rows"] if row["verdict"] == "zero"]
+    assert {row["quantity"] for row in zeros} == {"normal"}
+    agreeing = len(content["rows"]) - len(zeros)
+    assert content["verdicts"] == {"agrees": agreeing, "disagrees": 0, "zero": len(zeros)}
+    assert f"{agreeing} of {len(content['rows'])} agree, 0 disagree, {len(zeros)} compare zero with zero" in said
     for column in (
         "of",
         "by",
@@ -79,16 +85,16 @@ def test_a_model_whose_derivatives_agree_ends_with_a_table_and_status_0(
         "differences",
         "off",
         "left out",
-        "agrees",
+        "verdict",
     ):
         assert column in said.splitlines()[0]
-    assert said.count("yes") == len(content["rows"])
+    assert said.count("agrees") == agreeing
 
 
 def test_a_derivative_that_disagrees_is_status_1_and_said(
     model: Path, run: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
-    wrong = GradientRow("depth", "code", 0.5, 0.9, 3, 4, "", (1.0,), (2.0,), 10, 9, 0, False)
+    wrong = GradientRow("depth", "code", 0.5, 0.9, 3, 4, "", (1.0,), (2.0,), 10, 9, 0, "disagrees")
 
     def lying(*arguments, **options) -> GradientCheck:
         found = check_gradients(*arguments, **options)
@@ -99,7 +105,7 @@ def test_a_derivative_that_disagrees_is_status_1_and_said(
     content = facts(tmp_path)
     assert content["agrees"] is False
     assert content["rows"][-1]["worst"] == 0.9
-    assert " NO" in capsys.readouterr().out
+    assert "DISAGREES" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,8 @@ def test_autograd_and_finite_differences_agree_on_every_quantity_of_a_hit(name: 
     found = check_gradients(field, camera, parameters={"size": size}, size=24)
     for row in found.rows:
         if row.quantity in HITS:
-            assert row.agrees, row
+            assert row.verdict != "disagrees", row
+            assert row.agrees or (name, row.quantity) == ("box", "normal"), "only those of flat faces are constant"
             assert row.worst < 1e-4, row
             assert row.pixels > 50 or name == "box", row
             assert row.left_out < 0.1 * row.pixels, row

@@ -33,6 +33,7 @@ from distrace.render import render as render
 from distrace.render import render_each as render_each
 from distrace.surface import attach as attach
 from distrace.surface import clearance as clearance
+from distrace.surface import footprint_normals as footprint_normals
 from distrace.surface import normals as normals
 from distrace.trace import Outcome as Outcome
 from distrace.trace import Trace as Trace

@@ -26,6 +26,8 @@ Colour = Callable[[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 
 UNEXPLAINED = 0.5  # pixels before the tangent plane of what a neighbour sees: above, an outline may lie between
 ASIDE = 0.1  # pixels along the ray, to both sides of the least value, where the field is looked at
 ROUNDS = 2  # of Newton's, to where an outline crosses
+FEW = 64  # hits that tell whether exact normals have a derivative
+FLAT = 1e-4  # per radius: normals that turn less than this are constant
 BEYOND = 0.1  # pixels by which a ray that grazes the surface may be taken to miss it
 
 
@@ -36,13 +38,16 @@ def shade(
 
     Values are those at the centres of pixels. The gradient is that of the image seen through a tent two pixels wide,
     and reaches whatever requires grad in the field, the camera, the colour and the background. It costs evaluations
-    for the pixels beside outlines alone, and none where grad mode is off or nothing requires grad. Raises `ValueError`
-    for rays that are no image.
+    for the pixels beside outlines alone, and none where grad mode is off or nothing requires grad.
+
+    `colour` gets exact normals. Where those are constant in pieces, as a ReLU network's are, their derivative is that
+    of the footprint normals, at 32 evaluations a hit; a `colour` that does not use normals does not pay for it. Raises
+    `ValueError` for rays that are no image.
     """
     hit = buffers.mask
     if hit.dim() < 2:
         raise ValueError(f"buffers of shape {list(hit.shape)} were given; outlines are found in images [height, width]")
-    seen = colour(buffers.points, buffers.normal[hit], buffers.rays.directions[hit])
+    seen = colour(buffers.points, _normals(buffers, colour), buffers.rays.directions[hit])
     image = background.expand(*hit.shape, -1).masked_scatter(hit[..., None], seen)
     if not buffers.points.requires_grad:
         return image
@@ -53,6 +58,35 @@ def shade(
         for pixels, share in ((crossed.near, 1 - crossed.where), (crossed.far, crossed.where)):
             moving = moving.index_add(0, pixels, share[:, None] * change)
     return moving.reshape(image.shape)
+
+
+def _normals(buffers: Buffers, colour: Colour) -> Float[Tensor, "hits 3"]:
+    """Exact normals of hits, with the footprint normals' derivative if `colour` needs one and they have none."""
+    exact, points = buffers.normal[buffers.mask], buffers.points
+    if not (len(points) and points.requires_grad):
+        return exact
+    directions = buffers.rays.directions[buffers.mask]
+    if not (_uses_normals(colour, points, exact, directions) and _constant_normals(buffers)):
+        return exact
+    smooth = buffers.footprint_normal[buffers.mask]
+    return exact.detach() + (smooth - smooth.detach())
+
+
+def _uses_normals(colour: Colour, points: Tensor, normals: Tensor, directions: Tensor) -> bool:
+    """Whether colours depend on normals, by those of the first hit."""
+    normal = normals[:1].detach().requires_grad_()
+    seen = colour(points[:1].detach(), normal, directions[:1].detach())
+    return seen.requires_grad and torch.autograd.grad(seen.sum(), normal, allow_unused=True)[0] is not None
+
+
+def _constant_normals(buffers: Buffers) -> bool:
+    """Whether exact normals do not turn as the points move, at most of a few hits."""
+    every = -(-len(buffers.points) // FEW)
+    points = buffers.points[::every].detach().requires_grad_()
+    normals = surface.normals(buffers.near, points)
+    aside = torch.linalg.cross(normals.detach(), normals.detach().roll(1, -1) + 0.1)
+    (turning,) = torch.autograd.grad((normals * aside).sum(), points, allow_unused=True)
+    return turning is None or bool((turning.norm(dim=-1) < FLAT / buffers.radius).float().mean() > 0.5)
 
 
 @dataclass(frozen=True)

@@ -135,13 +135,19 @@ class Camera(ByValue):
         """Of the angle between each pixel's ray and the optical axis: depth over distance."""
         return 1 / self._ahead(self.pixels() if pixels is None else pixels).norm(dim=-1)
 
+    def pixel_angle(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
+        """The width that a pixel covers at a distance of 1: cos²θ / f, θ from the optical axis, f in pixels."""
+        pixels = self.pixels() if pixels is None else pixels
+        axes = (1,) * (pixels.dim() - 1)
+        focal = self.intrinsics[..., 0, 0].reshape(*self.intrinsics.shape[:-2], *axes)
+        return self.cosines(pixels) ** 2 / focal
+
     def tolerance(self, least_depth: float) -> Float[Tensor, "*batch height width"]:
         """DIST's convergence criterion: half the distance of what neighbouring pixels see at the least depth.
 
         ε = d · cos²θ / (2 f), f in pixels (Liu et al., CVPR 2020, section 3.2).
         """
-        focal = self.intrinsics[..., 0, 0].reshape(*self.intrinsics.shape[:-2], 1, 1)
-        return least_depth * self.cosines() ** 2 / (2 * focal)
+        return least_depth * self.pixel_angle() / 2
 
     def resized(self, factor: float) -> "Camera":
         """The same camera with a coarser or finer sensor; sizes are rounded up, so that every pixel stays covered.

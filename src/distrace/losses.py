@@ -26,9 +26,12 @@ def depth_loss(buffers: Buffers, observed: Float[Tensor, "*batch"]) -> Tensor:
 
 
 def normal_loss(buffers: Buffers, observed: Float[Tensor, "*batch 3"]) -> Tensor:
-    """Mean 1 − n · observed over the rays that hit and have a normal."""
+    """Mean 1 − n · observed over the rays that hit and have a normal.
+
+    n are the footprint normals: exact normals of a ReLU network have no derivative that the loss could descend.
+    """
     both = buffers.mask & (observed.norm(dim=-1) > 0.5)
-    return (1 - (buffers.normal[both] * observed[both]).sum(-1)).sum() / both.sum().clamp_min(1)
+    return (1 - (buffers.footprint_normal[both] * observed[both]).sum(-1)).sum() / both.sum().clamp_min(1)
 
 
 def silhouette_loss(buffers: Buffers, is_object: Bool[Tensor, "*batch"], tolerance: float) -> tuple[Tensor, Tensor]:

@@ -97,11 +97,16 @@ class Retraced:
 
 @torch.no_grad()
 def zero_beside(
-    sdf: SDF, rays: Rays, distance: Float[Tensor, "*batch"], slope: Float[Tensor, "*batch"], precision: float
+    sdf: SDF,
+    rays: Rays,
+    distance: Float[Tensor, "*batch"],
+    slope: Float[Tensor, "*batch"],
+    precision: float,
+    chords: int = CHORDS,
 ) -> Float[Tensor, "*batch"]:
     """The zero of f on each ray beside a distance at which f has a slope; NaN where chords do not end at one."""
     last = distance
-    for _ in range(CHORDS):
+    for _ in range(chords):
         last, distance = distance, distance - sdf(rays.at(distance)) / slope
     return distance.masked_fill(~((distance - last).abs() < precision), torch.nan)
 

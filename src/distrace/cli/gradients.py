@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from distrace.checking.gradcheck import STRAY, GradientRow, check_gradients
+from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, GradientRow, check_gradients
 from distrace.cli.common import ModelName, opened, orbiting, show_table
 from distrace.cli.console import console, origin, start
 
@@ -31,14 +31,20 @@ class CheckGradients:
         model, camera = opened(self.model, run.device), orbiting(self).to(run.device)
         found = check_gradients(model.field(self.code), camera, size=self.size)
         show_table([_line(row) for row in found.rows])
-        wrong = [row for row in found.rows if not row.agrees]
-        tolerance = found.precision.tolerance
-        count = f"{len(found.rows) - len(wrong)} of {len(found.rows)}"
-        console.print(f"{count} agree, to {tolerance:g} at all but {STRAY:.0%} of what is compared")
-        facts = {"agrees": found.agrees, "tolerance": tolerance, "stray": STRAY, "evaluations": found.evaluations}
+        console.print(_summary(found))
+        tolerances = {"tolerance": found.precision.tolerance, "stray": STRAY, "footprint_tolerance": ROUGHLY}
+        facts = {"agrees": found.agrees, "verdicts": found.verdicts(), **tolerances, "evaluations": found.evaluations}
         run.finish({**facts, "rows": [{"model": self.model, **asdict(row)} for row in found.rows], **origin()})
-        if wrong:
+        if not found.agrees:
             sys.exit(1)
+
+
+def _summary(found: GradientCheck) -> str:
+    counts = found.verdicts()
+    agree = f"{counts['agrees']} of {len(found.rows)} agree, {counts['disagrees']} disagree"
+    zeros = f"{counts['zero']} compare zero with zero and test nothing"
+    how = f"to {found.precision.tolerance:g} at all but {STRAY:.0%} of the pixels, footprint normals to {ROUGHLY:g}"
+    return f"{agree}, {zeros} ({how} in the median)"
 
 
 def _line(row: GradientRow) -> dict[str, object]:
@@ -57,5 +63,5 @@ def _line(row: GradientRow) -> dict[str, object]:
         "compared": row.pixels,
         "off": row.off,
         "left out": row.left_out,
-        "agrees": "yes" if row.agrees else "NO",
+        "verdict": "DISAGREES" if row.verdict == "disagrees" else row.verdict,
     }
