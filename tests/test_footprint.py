@@ -217,3 +217,19 @@ def test_with_a_kept_graph_or_as_a_sum_two_losses_have_both_gradients() -> None:
             terms[1].backward()
         slopes.append(radius.grad)
     torch.testing.assert_close(*slopes)
+
+
+def test_footprints_of_a_batch_of_orbits_have_the_angles_derivatives() -> None:
+    def middles(azimuth: Tensor) -> Tensor:
+        camera = Camera.orbit(azimuth, 20, 4.97, height=24, width=24)
+        return render(ellipsoid, camera, config=DYNAMIC).footprint_normal[:, 12, 12, 0]
+
+    def ellipsoid(points: Tensor) -> Tensor:
+        return 0.3 * (points / points.new_tensor([0.6, 0.4, 0.3])).norm(dim=-1) - 0.3
+
+    azimuth = torch.tensor([10.0, 100.0], dtype=f64, requires_grad=True)
+    (slope,) = torch.autograd.grad(middles(azimuth).sum(), azimuth)
+    with torch.no_grad():
+        difference = (middles(azimuth + 0.01) - middles(azimuth - 0.01)) / 0.02
+    torch.testing.assert_close(slope, difference, rtol=1e-2, atol=1e-5)
+    assert (slope.abs() > 1e-3).all()
