@@ -22,7 +22,7 @@ ORDER = [
         "checkpoint",
         "prior",
     ),
-    *("trace", "pyramid", "fast", "surface", "render", "boundary", "shading", "movie", "checking"),
+    *("trace", "pyramid", "tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photographs", "reconstruction"),
     *("pages", "evaluation", "cli", "__main__"),

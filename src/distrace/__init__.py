@@ -12,8 +12,6 @@ from distrace.checkpoint import load_model as load_model
 from distrace.checkpoint import save_model as save_model
 from distrace.data.view import View as View
 from distrace.data.view import load_view as load_view
-from distrace.fast.lattice import Lattice as Lattice
-from distrace.fast.lattice import LatticeConfig as LatticeConfig
 from distrace.field import SDF as SDF
 from distrace.field import chunked as chunked
 from distrace.field import placed as placed
@@ -30,7 +28,6 @@ from distrace.rays import Rays as Rays
 from distrace.rays import meet_sphere as meet_sphere
 from distrace.render import Buffers as Buffers
 from distrace.render import render as render
-from distrace.render import render_each as render_each
 from distrace.surface import attach as attach
 from distrace.surface import clearance as clearance
 from distrace.surface import footprint_normals as footprint_normals
@@ -39,3 +36,5 @@ from distrace.trace import Outcome as Outcome
 from distrace.trace import Trace as Trace
 from distrace.trace import TraceConfig as TraceConfig
 from distrace.trace import sphere_trace as sphere_trace
+from distrace.tracing.bounds import Occupancy as Occupancy
+from distrace.tracing.tracer import TracerConfig as TracerConfig

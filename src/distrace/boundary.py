@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace import surface
-from distrace.field import SDF, value_and_gradient
+from distrace.field import SDF, at_rows, value_and_gradient
 from distrace.rays import Bounds, Rays
 from distrace.render import Buffers
 
@@ -83,7 +83,8 @@ def _constant_normals(buffers: Buffers) -> bool:
     """Whether exact normals do not turn as the points move, at most of a few hits."""
     every = -(-len(buffers.points) // FEW)
     points = buffers.points[::every].detach().requires_grad_()
-    normals = surface.normals(buffers.near, points)
+    field = at_rows(buffers.field_at(buffers.mask), torch.arange(len(buffers.points), device=points.device)[::every])
+    normals = surface.normals(field, points)
     aside = torch.linalg.cross(normals.detach(), normals.detach().roll(1, -1) + 0.1)
     (turning,) = torch.autograd.grad((normals * aside).sum(), points, allow_unused=True)
     return turning is None or bool((turning.norm(dim=-1) < FLAT / buffers.radius).float().mean() > 0.5)

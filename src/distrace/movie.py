@@ -11,11 +11,11 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from distrace.camera import Camera
-from distrace.fast.picture import FastConfig
 from distrace.field import SDF
 from distrace.files import written
 from distrace.render import Buffers, Config, render
 from distrace.shading import Picture
+from distrace.tracing.tracer import TracerConfig
 
 Pictures = UInt8[np.ndarray, "frames height width 3"]
 
@@ -34,16 +34,16 @@ def turntable(camera: Camera, frames: int) -> list[Camera]:
 
 
 def filmed(
-    sdf: SDF, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = FastConfig()
+    sdf: SDF, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
 ) -> Iterator[Buffers]:
-    """Renders a field as each camera sees it. What the first image of the fast tracer learns of the field, all use.
+    """Renders a field as each camera sees it. All use the occupancy that the first image measures.
 
     Raises `ValueError` for a radius that is not positive.
     """
-    lattice = None
+    occupancy = None
     for camera in cameras:
-        buffers = render(sdf, camera, radius=radius, config=config, lattice=lattice)
-        lattice = buffers.lattice
+        buffers = render(sdf, camera, radius=radius, config=config, occupancy=occupancy)
+        occupancy = buffers.occupancy
         yield buffers
 
 

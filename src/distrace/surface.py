@@ -49,13 +49,19 @@ def _linearised(sdf: SDF, points: Float[Tensor, "*batch 3"], changes: bool) -> t
 
     Of many points the value's graph is made again when it is needed: a bound on memory, at one more evaluation.
     """
-    parts = points.reshape(-1, 3).split(PART)
+    parts = _parts(sdf, points.reshape(-1, 3))
     with torch.set_grad_enabled(changes and len(parts) <= 1):
-        pairs = [value_and_gradient(sdf, part, second_order=False) for part in parts]
+        pairs = [value_and_gradient(field, part, second_order=False) for field, part in parts]
     values, gradients = (torch.cat(part) for part in zip(*pairs))
     if changes and len(parts) > 1:
-        values = torch.cat([checkpoint(sdf, part, use_reentrant=False) for part in parts])
+        values = torch.cat([checkpoint(field, part, use_reentrant=False) for field, part in parts])
     return values.reshape(points.shape[:-1]), gradients.reshape(points.shape)
+
+
+def _parts(sdf: SDF, points: Float[Tensor, "n 3"]) -> list[tuple[SDF, Float[Tensor, "m 3"]]]:
+    """Points in parts whose graph fits in memory, each with the field of these points."""
+    rows = torch.arange(len(points), device=points.device)
+    return [(at_rows(sdf, some), points[some]) for some in rows.split(PART)]
 
 
 def normals(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
@@ -83,9 +89,10 @@ def footprint_normals(
     around = directions_of_taps(points)
     taps = points[..., None, :] + width[..., None, None] / 2 * around
     with torch.set_grad_enabled(_differentiable(sdf, taps)):
-        parts = taps.reshape(-1, 3).split(PART)
+        rows = torch.arange(points.numel() // 3, device=points.device).repeat_interleave(len(around))
+        parts = _parts(at_rows(sdf, rows), taps.reshape(-1, 3))
         again = torch.is_grad_enabled() and len(parts) > 1  # makes the graph again in the backward pass: less memory
-        values = [checkpoint(sdf, part, use_reentrant=False) if again else sdf(part) for part in parts]
+        values = [checkpoint(field, part, use_reentrant=False) if again else field(part) for field, part in parts]
         return normalize((torch.cat(values).reshape(taps.shape[:-1])[..., None] * around).sum(-2), dim=-1)
 
 
@@ -104,7 +111,6 @@ def clearance(
     rays: Rays,
     closest: Float[Tensor, "*batch"],
     bounds: Bounds | None = None,
-    other: Float[Tensor, "*batch"] | None = None,
     *,
     reach: float = 0.1,
     refine: int | None = None,
@@ -112,17 +118,9 @@ def clearance(
     """The least value of f on rays that miss, differentiable in the field and the ray; `closest` is the trace's sample.
 
     The march samples a ray no closer than its steps, so its least sample is not the minimum, and the gradient at it
-    would lie. A ray past several parts has as many minima: where an `other` may be as low it is looked for, too. At an
-    end of the bounds the derivative is that of the value at a fixed distance.
+    would lie. At an end of the bounds the derivative is that of the value at a fixed distance.
     """
-    fixed = rays.detach()
-    lowest, value = minimum_and_value(sdf, fixed, closest.detach(), bounds, reach=reach, refine=refine)
-    if other is not None:
-        with torch.no_grad():
-            near = (sdf(fixed.at(other)) < value + reach / 2).nonzero(as_tuple=True)
-        some = None if bounds is None else Bounds(bounds.near[near], bounds.far[near])
-        there, found = minimum_and_value(sdf, fixed[near], other[near], some, reach=reach, refine=refine)
-        lowest[near] = torch.where(found < value[near], there, lowest[near])
+    lowest = minimum(sdf, rays.detach(), closest.detach(), bounds, reach=reach, refine=refine)
     return least(sdf, rays, lowest, reach=reach, refine=refine)
 
 

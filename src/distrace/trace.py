@@ -27,14 +27,14 @@ class Outcome(IntEnum):
 class TraceConfig:
     """How rays are marched: t ← t + step_scale · f, until |f| < tolerance."""
 
-    steps: int = 100
-    step_scale: float = 1.5  # above 1 is DIST's aggressive marching: the sign of f walks an overshoot back
+    steps: int = 400
+    step_scale: float = 1.0  # above 1 is DIST's aggressive marching: the sign of f walks an overshoot back
     step_limit: float = 0.1  # f is clamped to ± this: decoders are trained on clamped distances and know no larger one
     tolerance: float | Float[Tensor, "*batch"] = 5e-5  # also per ray, as `Camera.tolerance` gives it
     compaction: bool = True  # only rays still on their way are queried; without, every ray at every step
     least_step: float = 0.0  # a ray that grazes the surface goes on by this at least, while it is outside
     polish: bool = True  # a ray that converged goes on to the zero of the secant through its last two samples
-    coarse_levels: int = 2  # the march starts at 1 / 2^levels of the resolution …
+    coarse_levels: int = 0  # the march starts at 1 / 2^levels of the resolution …
     coarse_steps: int = 3  # … and splits each ray into four after so many steps
 
     def __post_init__(self) -> None:
@@ -70,7 +70,6 @@ class Trace(ByValue):
     stopped: Float[Tensor, "*batch"]  # where the march stood when it ended, whatever the outcome
     evaluations: Int[Tensor, "*batch"]  # of the field, for this ray
     setup_evaluations: int = 0  # of the field, for no single ray: coarse levels, a lattice
-    slope: Float[Tensor, "*batch"] | None = None  # of f along the ray at its hit, where the tracer knows it; else NaN
 
     @property
     def hit(self) -> Bool[Tensor, "*batch"]:
@@ -85,11 +84,6 @@ class Trace(ByValue):
 
     def __getitem__(self, index: Tensor | tuple) -> "Trace":
         return self.of(lambda part: part[index])
-
-    def scaled(self, length: float, slope: float = 1.0) -> "Trace":
-        """The same in a world whose lengths are × `length`, of a field whose slopes are × `slope`."""
-        changed = {name: getattr(self, name) * length for name in ("distance", "closest", "stopped")}
-        return replace(self, **changed, slope=None if self.slope is None else self.slope * slope)
 
     def of(self, change: Callable[[Tensor], Tensor]) -> "Trace":
         """The same with every image changed."""

@@ -10,8 +10,8 @@ from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives, differences
 from distrace.checking.moves import Move
 from distrace.checking.retrace import Retraced, zero_beside
-from distrace.fast.neighbours import thinned
 from distrace.field import SDF
+from distrace.pixels import thinned
 from distrace.render import Buffers
 
 MOST = 64  # hits

@@ -9,8 +9,8 @@ from torch import Tensor
 from distrace import surface
 from distrace.camera import Camera
 from distrace.checking.differences import Images
-from distrace.fast.neighbours import thinned
 from distrace.field import SDF, value_and_gradient
+from distrace.pixels import thinned
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers
 from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.placement import TELL, Placement, nearest_to_rays, origins_of
-from distrace.fast.neighbours import thinned
+from distrace.pixels import thinned
 
 CELLS = 40  # along each axis
 ROUNDS = 3

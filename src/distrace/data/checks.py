@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.fast.neighbours import thinned
+from distrace.pixels import thinned
 
 WIDEST = 160.0  # degrees that a pinhole camera may see
 OBLONG = 4.0  # times that a pixel may be as long as wide

@@ -54,7 +54,7 @@ def by_network(repeats: int) -> Iterator[GrowthRow]:
 
 
 def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
-    """Views around a shape, each with the lattice of the first."""
+    """Views around a shape, each with the occupancy of the first."""
     for count in VIEWS:
         cameras = turntable(poster_view(256), count) if count > 1 else [poster_view(256)]
         yield from _rows("views", f"{count}", sdf, cameras, BOTH[:1], repeats)
@@ -86,10 +86,10 @@ def _rows(
     counted: dict[str, tuple[int, int]] = {}
 
     def run(strategy: str) -> Buffers:
-        views, lattice = [], None
+        views, occupancy = [], None
         for camera in cameras:
-            views.append(render(sdf, camera, config=STRATEGIES[strategy], lattice=lattice))
-            lattice = views[-1].lattice
+            views.append(render(sdf, camera, config=STRATEGIES[strategy], occupancy=occupancy))
+            occupancy = views[-1].occupancy
         counted[strategy] = sum(int(v.mask.sum()) for v in views), sum(v.trace.total_evaluations for v in views)
         return views[-1]
 

@@ -8,24 +8,20 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace.camera import Camera
-from distrace.fast.forecast import Kind, forecast
-from distrace.fast.lattice import Lattice
-from distrace.fast.passes import LATTICE_DOUBT
-from distrace.fast.roots import Guess, settle
-from distrace.fast.tracer import near_surface, prepared
 from distrace.field import SDF, value_and_gradient
 from distrace.fitting.sight import Sight
 from distrace.fitting.solver import Residuals
 from distrace.pose import object_in_camera
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
-from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
+from distrace.trace import Trace
+from distrace.tracing.bounds import Occupancy
+from distrace.tracing.tracer import TracerConfig, trace_rays
 
 APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
 CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
 REACH = 0.05  # for the least value on a ray: then to a fifth of that, and to a fifth of that
 CLOSE = 3e-4  # enough for a step of the solver
-MARCH = TraceConfig(coarse_levels=0, step_scale=1.2, tolerance=CLOSE, steps=30, least_step=1e-3)
 
 
 @dataclass(frozen=True)
@@ -39,35 +35,18 @@ class Accuracy:
 
 @dataclass(frozen=True)
 class Still:
-    """A shape that stays as it is, with the lattice that tells where its surface may be."""
+    """A shape that stays as it is, with the cells that may hold its surface."""
 
     sdf: SDF
-    near: SDF
-    lattice: Lattice
+    occupancy: Occupancy
 
     @staticmethod
     def of(sdf: SDF, like: Tensor) -> "Still":
-        lattice, _ = prepared(sdf, like)
-        return Still(sdf, near_surface(sdf, lattice), lattice)
+        ray = Rays(like.new_tensor([[0.0, 0.0, 2.0]]), like.new_tensor([[0.0, 0.0, 1.0]]))
+        return Still(sdf, trace_rays(sdf, ray)[1])
 
-    @torch.no_grad()
-    def trace(self, rays: Rays, bounds: Bounds) -> Trace:
-        """Rays with a clear root are settled there, those that may meet the surface are marched, others pass by."""
-        within = self.lattice.within(rays, bounds)
-        ahead = forecast(self.lattice, rays, within.near, within.far)
-        guess = Guess(ahead.distance, ahead.slope, torch.full_like(ahead.slope, LATTICE_DOUBT))
-        root = (ahead.kind == Kind.ROOT) & (ahead.begins > bounds.near)
-        settled = settle(self.lattice.near, rays[root], guess[root], CLOSE, self.lattice.cell)
-        distance = torch.full_like(ahead.distance, torch.inf)
-        distance[root] = settled.distance.nan_to_num(torch.inf)
-        left = (ahead.kind != Kind.NOTHING) & ~distance.isfinite()
-        some = Bounds(bounds.near.masked_fill(~left, torch.inf), bounds.far)
-        trace = sphere_trace(self.lattice.near, rays, some, MARCH, ahead.begins)
-        outcome = trace.outcome.masked_fill(distance.isfinite(), int(Outcome.HIT))
-        middle = -(rays.origins * rays.directions).sum(-1).clamp_max(0)  # beside the middle, where no more is known
-        passed = torch.where(ahead.closest.isfinite(), ahead.closest, middle)
-        closest = torch.where(left, trace.closest, passed)
-        return Trace(distance.minimum(trace.distance), outcome, closest, closest, trace.evaluations)
+    def trace(self, rays: Rays) -> Trace:
+        return trace_rays(self.sdf, rays, config=TracerConfig(tolerance=CLOSE), occupancy=self.occupancy)[0]
 
 
 @torch.no_grad()
@@ -80,7 +59,7 @@ def residuals(shape: Still, sight: Sight, camera: Camera, accuracy: Accuracy, *,
     """
     rays, cosines = camera.rays(sight.pixels), camera.cosines(sight.pixels)
     bounds = meet_sphere(rays)
-    trace = shape.trace(rays, bounds)
+    trace = shape.trace(rays)
     beyond = sight.is_background & trace.hit & (sight.outside.norm(dim=-1) > 0)
     lacking = torch.where(trace.hit, sight.is_background & ~beyond, sight.is_object)
     astray = lacking & ~bounds.meets
@@ -90,13 +69,13 @@ def residuals(shape: Still, sight: Sight, camera: Camera, accuracy: Accuracy, *,
     some = Bounds(bounds.near[low], bounds.far[low])
     t[low] = minimum(shape.sdf, rays[low], t[low], some, reach=REACH, refine=2)
     rows = (lacking | beyond | seen).nonzero()[:, 0]
-    here = _Here.of(shape.near, camera, rays[rows], t[rows], astray[rows], focal=focal)
+    here = _Here.of(shape.sdf, camera, rays[rows], t[rows], astray[rows], focal=focal)
     off = (t * cosines - sight.depth)[rows] * here.slope / cosines[rows]
     parts = [
         here.part(here.value, lacking[rows], accuracy.outline),
         here.part(off, (seen & sight.depth.isfinite())[rows], accuracy.depth),
         here.across(sight.outside[rows], beyond[rows], camera, accuracy.outline),
-        here.normals(shape.near, sight.normal[rows], (seen & sight.has_normal)[rows], accuracy.normal),
+        here.normals(shape.sdf, sight.normal[rows], (seen & sight.has_normal)[rows], accuracy.normal),
     ]
     values, jacobian = (torch.cat(part) for part in zip(*parts))
     weights = torch.full_like(values, 1 / len(sight.pixels))

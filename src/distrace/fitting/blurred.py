@@ -14,7 +14,6 @@ from distrace.field import value_and_gradient
 from distrace.fitting.alignment import Still
 from distrace.fitting.solver import Residuals
 from distrace.pose import turned_object
-from distrace.rays import meet_sphere
 
 SIZE = 32  # pixels along the longer side
 STEP = 0.02  # of differences: radians, and radii of the unit sphere
@@ -55,8 +54,8 @@ class Blurred:
         """What the camera sees where normals are known."""
         coarse = camera.resized(self.factor)
         rays = coarse.rays().flat()
-        trace = self.shape.trace(rays, meet_sphere(rays))
-        _, gradient = value_and_gradient(self.shape.near, rays[trace.hit].at(trace.distance[trace.hit]))
+        trace = self.shape.trace(rays)
+        _, gradient = value_and_gradient(self.shape.sdf, rays[trace.hit].at(trace.distance[trace.hit]))
         normals = torch.zeros_like(rays.directions)
         normals[trace.hit] = F.normalize(gradient, dim=-1) @ camera.T_world_camera[:3, :3]
         return blurred(normals.T.reshape(3, coarse.height, coarse.width) * self.known, self.sigma)

@@ -36,9 +36,7 @@ class Comparison:
 
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
-    trace: TraceConfig = field(
-        default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
-    )
+    trace: TraceConfig = field(default_factory=lambda: TraceConfig(tolerance=1e-3, steps=50, least_step=2e-3))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,7 @@ class FitConfig(Starts):
     mask_rays: int = 500
     weights: Weights = Weights()
     margin: float = 0.005  # how far the surface is to stay from rays of the background
-    trace: TraceConfig = field(default_factory=lambda: TraceConfig(coarse_levels=0, tolerance=5e-4))
+    trace: TraceConfig = field(default_factory=lambda: TraceConfig(steps=150, tolerance=5e-4))
 
 
 def fit_shape(decoder: Decoder, views: Sequence[View], prior: Prior, config: FitConfig = FitConfig()) -> Iterator[Step]:

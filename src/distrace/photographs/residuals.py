@@ -31,7 +31,7 @@ SATURATED = 3.0  # scales: outlines that are off by more hardly pull
 REACH, ROUNDS = 0.05, 2  # of the search for the least value
 PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # of turn, shift, and growth: radians, radii, logarithm
 PLACE = len(PLACE_DEVIATIONS)
-MARCH = TraceConfig(coarse_levels=0, tolerance=1e-3, steps=30, least_step=2e-3)
+MARCH = TraceConfig(tolerance=1e-3, steps=50, least_step=2e-3)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,70 @@
+"""The field as the tracer evaluates it: in the unit sphere, of one shape or a batch, exactly or roughly, and counted."""
+
+from collections.abc import Callable
+
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from distrace.batch_field import BatchField
+from distrace.decoder import ShapeField
+from distrace.field import SDF, asked
+from distrace.quickest import quickest
+from distrace.tracing.batch import Batch
+
+ROUGH_ERROR = 2e-3  # radii: twice the largest error of bfloat16 products near the surface of 8 × 512 decoders
+
+Values = Callable[[Batch, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
+
+
+class Evaluator:
+    """Values along rays, in radii of the sphere, divided by the Lipschitz constant once it is known.
+
+    `rough` values are in cheaper products, where this machine has them, and good to `error`.
+    """
+
+    def __init__(self, sdf: SDF | BatchField, radius: float) -> None:
+        self.sdf, self.radius = sdf, radius
+        self.shapes = len(sdf) if isinstance(sdf, BatchField) else 1
+        cheap = rough_field(sdf)
+        self.cheap = sdf if cheap is None else cheap
+        self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
+        self.scale: Float[Tensor, shapes] | None = None
+        self.evaluations = 0
+
+    def exact(self, batch: Batch, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
+        """Values at distances along rays."""
+        return self.at(batch.at(t), batch.view)
+
+    def rough(self, batch: Batch, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
+        return self.at(batch.at(t), batch.view, rough=True)
+
+    def at(
+        self, points: Float[Tensor, "*k n 3"], shape: Int[Tensor, "n"], *, rough: bool = False
+    ) -> Float[Tensor, "*k n"]:
+        """Values at points of the unit sphere, each of the shape of its number."""
+        self.evaluations += points.numel() // 3
+        field = self.cheap if rough else self.sdf
+        world = points if self.radius == 1 else points * self.radius
+        if isinstance(field, BatchField):
+            each = shape.expand(points.shape[:-1]).reshape(-1)
+            values = field.evaluate(world.reshape(-1, 3), each).reshape(points.shape[:-1])
+        else:
+            values = asked(field, world)
+        if self.scale is None:
+            return values if self.radius == 1 else values / self.radius
+        return values * (self.scale[shape] if self.shapes > 1 else self.scale)
+
+    def normalise(self, lipschitz: Float[Tensor, "shapes"]) -> None:
+        """From here on |f| is at most the distance to the surface."""
+        self.scale = 1 / (self.radius * lipschitz)
+        self.error = self.error / float(lipschitz.min()) if self.error else 0.0
+
+
+def rough_field(sdf: SDF | BatchField) -> SDF | BatchField | None:
+    """A decoder's field in bfloat16 products, where those are faster on this machine; else none."""
+    code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
+    decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
+    if decoder is None or code is None:
+        return None
+    quick = quickest(decoder)
+    return None if quick is decoder else quick.field(code.detach())
