@@ -100,7 +100,7 @@ def march_rays(
         t, following = (times.gather(0, at)[0] for at in (last, last + 1))
         slope = (ahead - value) / (following - t)
         root = following - ahead / slope
-        crossed = allowed & (ahead < -error)
+        crossed = allowed & (ahead <= -error)
         near = allowed & predict & (slope < -FLAT) & (root - following < ahead + AHEAD)
         unsure = allowed & ~(crossed | near) & ~(ahead.abs() > error)
         t_next = torch.where(allowed, following, t)
