@@ -71,7 +71,10 @@ def test_background_is_inf_and_depth_is_z() -> None:
 
 @every_strategy
 def test_clearance_is_the_least_value_on_every_ray_that_misses(config: Config) -> None:
-    """Also where a coarse ray has marched past it: it was off by 0.06 there."""
+    """Also where a coarse ray has marched past it: it was off by 0.06 there.
+
+    Where the default tracer has excluded a ray with its cells it is a value on the ray, near the least.
+    """
     camera = view(32)
     buffers = render(primitives.sphere(0.3), camera, config=config)
     rays = camera.rays()
@@ -79,7 +82,11 @@ def test_clearance_is_the_least_value_on_every_ray_that_misses(config: Config) -
     meets = meet_sphere(rays).meets
     assert (buffers.clearance[~meets] == torch.inf).all()
     missed = meets & ~buffers.mask
-    torch.testing.assert_close(buffers.clearance[missed], true[missed], rtol=0, atol=1e-6)
+    excluded = missed & (buffers.trace.evaluations == 0)
+    assert (missed & ~excluded).sum() > 20
+    torch.testing.assert_close(buffers.clearance[missed & ~excluded], true[missed & ~excluded], rtol=0, atol=1e-6)
+    over = (buffers.clearance - true)[excluded]
+    assert ((over > -1e-9) & (over < 0.01)).all()
     assert buffers.clearance[buffers.mask].abs().max() < 5e-5
 
 

@@ -1,5 +1,6 @@
 """The default tracer: cells that may hold surface, cones of blocks of pixels, predicted roots, single rays."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -40,8 +41,9 @@ class TracerConfig:
     lipschitz: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0 or (self.lipschitz is not None and not 0 < self.lipschitz < float("inf")):
-            raise ValueError(f"{self} cannot trace: the tolerance and the Lipschitz constant must be positive")
+        given = [self.tolerance] if self.lipschitz is None else [self.tolerance, self.lipschitz]
+        if not all(0 < each < math.inf for each in given):
+            raise ValueError(f"{self} cannot trace: the tolerance and the Lipschitz constant must be positive, finite")
 
 
 @torch.no_grad()
@@ -54,12 +56,13 @@ def trace_images(
 ) -> tuple[Trace, Occupancy]:
     """Traces all pixels of a camera, or of a batch of them; the occupancy serves further views of the same field.
 
-    Raises `ValueError` for an occupancy of another radius, and for another number of cameras than of shapes.
+    Raises `ValueError` for an occupancy of another radius or number of shapes, and for another number of cameras than
+    of shapes.
     """
     camera = camera.detach()
     images = Images(camera, radius)
     evaluator, occupancy, setup = _prepared(sdf, images.eye, radius, config, occupancy)
-    if evaluator.shapes > 1 and evaluator.shapes != images.views:
+    if isinstance(sdf, BatchField) and evaluator.shapes != images.views:
         raise ValueError(
             f"a field of {evaluator.shapes} shapes and {images.views} cameras were given; give a camera for each shape"
         )
@@ -113,6 +116,10 @@ def _prepared(
         occupancy = find_occupancy(evaluator, like, config.lipschitz)
     elif occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
+    elif len(occupancy.occupied) != evaluator.shapes:
+        raise ValueError(
+            f"an occupancy of {len(occupancy.occupied)} shapes was given with a field of {evaluator.shapes}; leave it out"
+        )
     setup, evaluator.evaluations = evaluator.evaluations, 0
     evaluator.normalise(occupancy.lipschitz)
     return evaluator, occupancy, setup
