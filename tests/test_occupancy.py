@@ -49,7 +49,7 @@ def test_no_excluded_cell_holds_a_change_of_sign(number: int) -> None:
         points = torch.rand(60_000, 3, generator=torch.Generator().manual_seed(0)) * 2 - 1
         points = points[points.norm(dim=1) < 1]
         solid = points[sdf(points) <= 0]
-        assert len(solid) > 300
+        assert len(solid) > 200
         x, y, z = ((solid + 1) * (cells / 2)).long().unbind(1)
         assert kept[x, y, z].all()
     assert occupancy.occupied.float().mean() < 0.5, "most of the sphere is empty"
@@ -118,8 +118,7 @@ def test_where_a_ray_is_lowest_is_near_its_least_value() -> None:
     """In a batch of two shapes, of each ray's own."""
     first, second = primitives.sphere(0.5), primitives.sphere(0.2, torch.tensor([0.3, -0.2, 0.1]))
     both = torch.cat([occupancy_of(sdf).values for sdf in (first, second)])
-    single = occupancy_of(first)
-    occupancy = Occupancy(single.occupied, single.lipschitz, both, 1.0, 0)
+    occupancy = Occupancy(torch.ones(2, 32, 32, 32, dtype=torch.bool), torch.ones(2), both, 1.0, 0)
     rays = view(24).rays().flat()
     rays = rays[meet_sphere(rays).meets]
     for shape, (sdf, centre) in enumerate(((first, torch.zeros(3)), (second, torch.tensor([0.3, -0.2, 0.1])))):
