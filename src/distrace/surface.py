@@ -207,4 +207,6 @@ def minimum_and_value(
 
 def _differentiable(sdf: SDF, points: Tensor) -> bool:
     """Whether a gradient can reach anything: the points, or what the field was made from, which one value tells."""
-    return torch.is_grad_enabled() and (points.requires_grad or sdf(points.detach().reshape(-1, 3)[:1]).requires_grad)
+    first = points.detach().reshape(-1, 3)[:1]
+    field = at_rows(sdf, torch.arange(len(first), device=points.device))
+    return torch.is_grad_enabled() and (points.requires_grad or field(first).requires_grad)
