@@ -190,13 +190,13 @@ def _traced(evaluator: Evaluator, batch: Batch, predicted: Roots | None, toleran
         evaluations[at] += found.evaluations
         missed = (found.t.isnan() & ~beyond & (found.clear < some.far[marched.roots.ray])).nonzero()[:, 0]
         left = torch.cat([marched.stopped, marched.roots.ray[missed]])
-        begins = ray[marched.inside]
+        begins, first = ray[marched.inside], some[marched.inside]
         ray, some = ray[left], some[left].from_(torch.cat([marched.clear, found.clear[missed]]))
     outcome[ray] = int(Outcome.EXHAUSTED)
     outcome[begins] = int(Outcome.INSIDE)
-    first = batch[begins]
-    passed = begins[first.t > meet_sphere(Rays(first.origins, first.directions)).near + tolerance]
-    back = _stepped_back(evaluator, batch[passed], tolerance)
+    past = (first.t > meet_sphere(Rays(first.origins, first.directions)).near + tolerance).nonzero()[:, 0]
+    passed = begins[past]
+    back = _stepped_back(evaluator, first[past], tolerance)
     distance[passed] = back.t
     evaluations[passed] += back.evaluations
     hit = ~distance.isnan()
