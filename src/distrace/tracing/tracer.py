@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from distrace.batch_field import BatchField
@@ -69,7 +69,6 @@ def trace_images(
     level = images.level_of(TOP)
     stride = BRANCH**level
     batch = occupancy.entered(images.blocks(stride))
-    before: Float[Tensor, n] | None = None
     predicted: Roots | None = None
     while stride > 1:
         batch = march_cones(evaluator, batch, reach(stride), CONE_STEPS)
@@ -93,7 +92,7 @@ def trace_images(
 def trace_rays(
     sdf: SDF, rays: Rays, radius: float = 1.0, config: TracerConfig = TracerConfig(), occupancy: Occupancy | None = None
 ) -> tuple[Trace, Occupancy]:
-    """The same for rays that are no image [n]: each is marched on its own. Raises `ValueError` as `trace_images` does."""
+    """The same for rays that are no image [n]: each is marched on its own. Raises `ValueError` as that does."""
     rays = rays.detach()
     evaluator, occupancy, setup = _prepared(sdf, rays.directions, radius, config, occupancy)
     unit = Rays(rays.origins / radius, rays.directions)
@@ -128,8 +127,9 @@ def _prepared(
     elif occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
     elif len(occupancy.occupied) != evaluator.shapes:
+        given = len(occupancy.occupied)
         raise ValueError(
-            f"an occupancy of {len(occupancy.occupied)} shapes was given with a field of {evaluator.shapes}; leave it out"
+            f"an occupancy of {given} shapes was given with a field of {evaluator.shapes}; leave the occupancy out"
         )
     setup, evaluator.evaluations = evaluator.evaluations, 0
     evaluator.normalise(occupancy.lipschitz)
