@@ -58,7 +58,7 @@ def photographs(decoder: Decoder, cameras: Sequence[Camera], place: Similarity |
 
 @pytest.fixture(scope="module")
 def decoder() -> Decoder:
-    return bumpy_balls()
+    return bumpy_balls(0.4)
 
 
 @pytest.fixture(scope="module")
@@ -170,7 +170,7 @@ def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[P
     size = 3 * len(problem.pairs)
     rows = torch.arange(len(before.values))
     wanted = rows < size if kind == "colour" else (rows >= size) & (rows < size + int(look.wrong.sum()))
-    assert wanted.sum() > 30
+    assert wanted.sum() > 20
     direction = torch.randn(11, generator=random)
     step = 2e-3 * direction / direction.norm()
     ahead, behind = (changed(problem, shape, sign * step) for sign in (1, -1))
