@@ -30,7 +30,7 @@ class Occupancy:
     evaluations: int
 
     def entered(self, batch: Batch) -> Batch:
-        """Rays from the first to the last cell on their way that may hold surface; those that meet none are left out."""
+        """Rays from the first to the last cell on their way that may hold surface, without those that meet none."""
         rays = Rays(batch.origins, batch.directions)
         cells = self.occupied.shape[-1]
         bounds = meet_sphere(rays, 1 + 2 / cells)

@@ -1,4 +1,4 @@
-"""The field as the tracer evaluates it: in the unit sphere, of one shape or a batch, exactly or roughly, and counted."""
+"""The field as the tracer evaluates it: in the unit sphere, of one shape or several, exactly or roughly, counted."""
 
 from collections.abc import Callable
 

@@ -76,7 +76,7 @@ def march_rays(
     active = torch.arange(len(t), device=t.device)
     value = evaluate(batch, t)
     doubtful = ~(value > error)
-    inside = (value < -error).nonzero()[:, 0]
+    inside = (value <= -error).nonzero()[:, 0]
     least, closest = value.clone(), t.clone()
     evaluations = torch.ones_like(active)
     stopped, clear = [active[doubtful]], [t[doubtful]]
@@ -100,7 +100,7 @@ def march_rays(
         t, following = (times.gather(0, at)[0] for at in (last, last + 1))
         slope = (ahead - value) / (following - t)
         root = following - ahead / slope
-        crossed = allowed & (ahead < -error)
+        crossed = allowed & (ahead <= -error)
         near = allowed & predict & (slope < -FLAT) & (root - following < ahead + AHEAD)
         unsure = allowed & ~(crossed | near) & ~(ahead.abs() > error)
         t_next = torch.where(allowed, following, t)

@@ -45,7 +45,7 @@ def refine(
     for look in range(looks):
         at, slope, low, high, last, last_value, farthest = state.unbind(1)
         value = evaluator.exact(some, at)
-        inside = value < 0
+        inside = value <= 0
         low = torch.where(inside, low, at)
         high = torch.where(inside, at, high)
         bracketed = high < torch.inf
