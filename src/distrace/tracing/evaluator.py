@@ -28,7 +28,7 @@ class Evaluator:
         cheap = rough_field(sdf)
         self.cheap = sdf if cheap is None else cheap
         self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
-        self.scale: Float[Tensor, shapes] | None = None
+        self.scale: Tensor | None = None  # [shapes]
         self.evaluations = 0
 
     def exact(self, batch: Batch, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:

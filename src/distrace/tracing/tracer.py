@@ -66,7 +66,6 @@ def trace_images(
     level = images.level_of(TOP)
     stride = BRANCH**level
     batch = occupancy.entered(images.blocks(stride))
-    before: Float[Tensor, n] | None = None
     predicted: Roots | None = None
     while stride > 1:
         batch = march_cones(evaluator, batch, reach(stride), CONE_STEPS)
