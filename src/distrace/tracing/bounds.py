@@ -1,4 +1,4 @@
-"""Where a surface can be: an octree of cell centres, each of which excludes a ball by the field's Lipschitz constant."""
+"""Where a surface can be: an octree of cell centres, each of which excludes a ball by a Lipschitz constant of f."""
 
 from dataclasses import dataclass, replace
 
