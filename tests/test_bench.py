@@ -97,7 +97,8 @@ def test_queries_fall_in_the_published_order(table: dict[str, tuple[Row, Buffers
     entering = int(meet_sphere(poster_view(64).rays()).meets.sum())
     assert order[0] == 50 * entering, "every ray at every step"
     assert order[-1] < order[0] / 5
-    assert table["fast"][0].queries < order[-1] / 1.5, "of 64 pixels a side: more than half of it is for the lattice"
+    fast = table["fast"][0]
+    assert fast.queries - fast.setup_queries < order[-1] / 1.5, "of 64 pixels a side: the rest is for cells and cones"
 
 
 def test_naive_is_a_sample_of_rays_each_for_all_of_its_steps(table: dict[str, tuple[Row, Buffers]]) -> None:
@@ -139,11 +140,10 @@ def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() ->
     assert len(rows) == COUNT
     entering = int(meet_sphere(poster_view(48).rays()).meets.sum())
     assert rows["original"].queries == rows["coarse_to_fine"].queries + entering
-    assert rows["fast_next"].setup_queries == rows["fast_camera"].setup_queries == 0
-    assert rows["fast_code"].setup_queries > 0, "another shape has another lattice"
-    for name in ("fast", "fast_next", "fast_camera", "fast_code"):
+    assert rows["fast_next"].setup_queries < rows["fast"].setup_queries - 16**3, "no cells, but cones"
+    for name in ("fast", "fast_next"):
         assert (rows[name].iou, rows[name].outliers) == (1.0, 0)
-    assert rows["fast_camera"].queries <= rows["fast_next"].queries < rows["fast"].queries
+    assert rows["fast_next"].queries < rows["fast"].queries
 
 
 def test_times_are_medians_of_runs_in_turn_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,11 +62,6 @@ def test_a_steeper_field_gives_the_same_image() -> None:
         assert (buffers.mask == torch.isfinite(truth)).float().mean() > 0.998
         both = buffers.mask & torch.isfinite(truth)
         assert (buffers.depth - truth)[both].abs().max() < 1e-3
-        points = buffers.points.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(steepness * SOFA(points).sum(), points)
-        slope = (gradient * buffers.rays.directions[buffers.mask]).sum(-1)
-        error = (buffers.trace.slope[buffers.mask] / slope - 1).abs()
-        assert error.nanmedian() < 0.2, "of the field, not of what was traced"
 
 
 def test_the_page_tells_what_went_unnoticed(rows: list[FieldRow]) -> None:

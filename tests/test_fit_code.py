@@ -38,7 +38,7 @@ CONFIG = CodeFitConfig(starts=1, compared=Comparison(weights=Weights(code=1e-6))
 
 @pytest.fixture(scope="module")
 def decoder() -> Decoder:
-    return bumpy_balls()
+    return bumpy_balls(0.35)
 
 
 @pytest.fixture(scope="module")

@@ -39,7 +39,7 @@ def test_more_pixels_cost_more_and_each_of_them_less() -> None:
     assert small.per_pixel > large.per_pixel
 
 
-def test_views_share_one_lattice() -> None:
+def test_views_share_one_occupancy() -> None:
     one, three = growth.by_views(sphere(0.5), 1)
     assert three.visible > 2.9 * one.visible
     assert three.queries < 3 * one.queries

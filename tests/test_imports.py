@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("threads", "errors", "files", "processes", "equality", "rays", "pixels", "viewpoint", "camera", "pose"),
+    *("threads", "errors", "files", "processes", "equality", "pixels", "rays", "viewpoint", "camera", "pose"),
     *(
         "field",
         "batch_field",

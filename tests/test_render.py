@@ -8,10 +8,10 @@ from torch import Tensor
 
 from distrace import primitives
 from distrace.camera import Camera
-from distrace.fast.picture import FastConfig
 from distrace.rays import meet_sphere
-from distrace.render import STRATEGIES, Buffers, Config, render, render_each, render_rays
+from distrace.render import STRATEGIES, Buffers, Config, render, render_rays
 from distrace.trace import COARSE_TO_FINE, DYNAMIC, Outcome
+from distrace.tracing.tracer import TracerConfig
 
 f64 = torch.float64
 EXACT = replace(DYNAMIC, steps=500, tolerance=1e-9)
@@ -35,8 +35,8 @@ def seen(buffers: Buffers) -> Tensor:
 
 
 def exactly(config: Config) -> Config:
-    if isinstance(config, FastConfig):
-        return replace(config, tolerance=1e-9, march=replace(config.march, tolerance=1e-9))
+    if isinstance(config, TracerConfig):
+        return replace(config, tolerance=1e-9)
     return replace(config, tolerance=1e-9, steps=300)
 
 
@@ -71,7 +71,10 @@ def test_background_is_inf_and_depth_is_z() -> None:
 
 @every_strategy
 def test_clearance_is_the_least_value_on_every_ray_that_misses(config: Config) -> None:
-    """Also where a coarse ray has marched past it: it was off by 0.06 there."""
+    """Also where a coarse ray has marched past it: it was off by 0.06 there.
+
+    Where the default tracer has excluded a ray with its cells it is a value on the ray, near the least.
+    """
     camera = view(32)
     buffers = render(primitives.sphere(0.3), camera, config=config)
     rays = camera.rays()
@@ -79,7 +82,11 @@ def test_clearance_is_the_least_value_on_every_ray_that_misses(config: Config) -
     meets = meet_sphere(rays).meets
     assert (buffers.clearance[~meets] == torch.inf).all()
     missed = meets & ~buffers.mask
-    torch.testing.assert_close(buffers.clearance[missed], true[missed], rtol=0, atol=1e-6)
+    excluded = missed & (buffers.trace.evaluations == 0)
+    assert (missed & ~excluded).sum() > 20
+    torch.testing.assert_close(buffers.clearance[missed & ~excluded], true[missed & ~excluded], rtol=0, atol=1e-6)
+    over = (buffers.clearance - true)[excluded]
+    assert ((over > -1e-9) & (over < 0.01)).all()
     assert buffers.clearance[buffers.mask].abs().max() < 5e-5
 
 
@@ -219,21 +226,6 @@ def test_the_preview_has_the_same_values() -> None:
 def test_a_radius_that_holds_nothing_is_refused(radius: float) -> None:
     with pytest.raises(ValueError, match=f"radius of {radius}"):
         render(primitives.sphere(0.5), view(4), radius=radius)
-
-
-def test_several_fields_are_seen_as_each_alone() -> None:
-    fields = [primitives.sphere(0.3), primitives.sphere(0.5), primitives.box(torch.tensor([0.4, 0.2, 0.3], dtype=f64))]
-    cameras = [view(12, azimuth) for azimuth in (0, 50, 200)]
-    for given in (cameras, cameras[0]):
-        together = render_each(fields, given)
-        for sdf, camera, buffers in zip(
-            fields, cameras if given is cameras else [cameras[0]] * 3, together, strict=True
-        ):
-            alone = render(sdf, camera)
-            assert (buffers.trace.outcome == alone.trace.outcome).all()
-            torch.testing.assert_close(buffers.depth, alone.depth, rtol=0, atol=0)
-    with pytest.raises(ValueError, match="3 fields and 2 cameras"):
-        render_each(fields, cameras[:2])
 
 
 def test_what_was_first_read_without_gradients_has_them_later() -> None:

@@ -366,25 +366,14 @@ def test_a_least_step_is_kept_outside_and_not_in_the_solid() -> None:
 
 
 def test_a_trace_is_indexed_as_its_images_are() -> None:
-    whole = replace(trace(scene, view().rays()), slope=torch.rand(24, 24), setup_evaluations=7)
+    whole = replace(trace(scene, view().rays()), setup_evaluations=7)
     for index in ((slice(3, 9), slice(None, None, 2)), whole.hit, (5, 7), (..., slice(4, 6))):
         part = whole[index]
         assert part.setup_evaluations == 7
         for name, image in whole.images().items():
             torch.testing.assert_close(getattr(part, name), image[index], equal_nan=True)
-    assert set(whole.images()) == {"distance", "outcome", "closest", "stopped", "evaluations", "slope"}
-    assert whole[(slice(4), slice(6))].reshaped(torch.Size([24])).slope.shape == (24,)
-
-
-def test_a_scaled_trace_has_scaled_lengths_and_slopes_and_the_same_rest() -> None:
-    whole = replace(trace(scene, view().rays()), slope=torch.rand(24, 24))
-    scaled = whole.scaled(2.0, 3.0)
-    for name in ("distance", "closest", "stopped"):
-        torch.testing.assert_close(getattr(scaled, name), 2 * getattr(whole, name))
-    torch.testing.assert_close(scaled.slope, 3 * whole.slope)
-    assert (scaled.hit == whole.hit).all()
-    assert scaled.total_evaluations == whole.total_evaluations
-    assert trace(scene, view().rays()).scaled(2.0).slope is None
+    assert set(whole.images()) == {"distance", "outcome", "closest", "stopped", "evaluations"}
+    assert whole[(slice(4), slice(6))].reshaped(torch.Size([24])).distance.shape == (24,)
 
 
 def test_a_trace_carries_no_gradient() -> None:

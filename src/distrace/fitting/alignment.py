@@ -1,6 +1,6 @@
 """How far a known shape before a camera is from what was observed: residuals along rays and their exact Jacobian."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -46,7 +46,10 @@ class Still:
         return Still(sdf, trace_rays(sdf, ray)[1])
 
     def trace(self, rays: Rays) -> Trace:
-        return trace_rays(self.sdf, rays, config=TracerConfig(tolerance=CLOSE), occupancy=self.occupancy)[0]
+        """Where rays hit the shape; `closest`, of those that miss the unit sphere, is where they come nearest to it."""
+        trace, _ = trace_rays(self.sdf, rays, config=TracerConfig(tolerance=CLOSE), occupancy=self.occupancy)
+        nearest = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
+        return replace(trace, closest=torch.where(trace.closest.isfinite(), trace.closest, nearest))
 
 
 @torch.no_grad()

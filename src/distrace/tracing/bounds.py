@@ -51,13 +51,17 @@ class Occupancy:
     @torch.no_grad()
     def lowest(self, rays: Rays, bounds: Bounds, shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
         """Where along rays of the world the value between the coarse cells' centres is least."""
+        volume = self.values.reshape(1, 1, -1, CELLS, CELLS)  # all shapes in a row
+        last = volume.new_tensor(volume.shape[2:]) - 1
+        before = F.pad(shape[:, None] * CELLS, (0, 2))
         best, least = bounds.near, torch.full_like(bounds.near, torch.inf)
         for k in range(SAMPLES // 2):
             t = torch.lerp(bounds.near, bounds.far, (2 * k + 1) / SAMPLES)
-            place = rays.at(t) / (self.radius * (1 - 1 / CELLS))
-            index = ((place + 1) * (CELLS - 1) / 2).round().long().clamp(0, CELLS - 1)
-            x, y, z = index.unbind(-1)
-            value = self.values[shape, x, y, z]
+            place = (rays.at(t) / self.radius + 1) * (CELLS / 2) - 0.5
+            index = place.clamp(0, CELLS - 1)
+            grid = (2 * (index + before) / last - 1).flip(-1).reshape(1, 1, 1, -1, 3)
+            value = F.grid_sample(volume, grid, align_corners=True).reshape(-1)
+            value = value + (place - index).norm(dim=-1) * (2 / CELLS)  # f grows away from the surface
             best, least = torch.where(value < least, t, best), value.minimum(least)
         return best
 
@@ -113,4 +117,4 @@ def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step:
     whose = torch.arange(shapes, device=centres.device).repeat_interleave(3 * PROBES)
     moved = evaluator.at(ahead.reshape(-1, 3), whose).reshape(shapes, PROBES, 3)
     here = evaluator.at(centres[nearest].reshape(-1, 3), whose[::3]).reshape(shapes, PROBES, 1)
-    return ((moved - here) / step).norm(dim=-1).quantile(STEEP, dim=1)
+    return ((moved - here) / step).norm(dim=-1).kthvalue(int(STEEP * PROBES), dim=1).values

@@ -37,7 +37,7 @@ class Marched:
     roots: Roots
     stopped: Int[Tensor, "n"]  # rays that were still on their way, or in doubt …
     clear: Float[Tensor, "n"]  # … and how far they came
-    inside: Int[Tensor, "n"]  # rays that began inside
+    inside: Int[Tensor, "begun"]  # rays that began inside
     closest: Float[Tensor, "rays"]  # where f was least, of all rays
     evaluations: Int[Tensor, "rays"]
 

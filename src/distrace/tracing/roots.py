@@ -45,7 +45,7 @@ def refine(
     for look in range(looks):
         at, slope, low, high, last, last_value, farthest = state.unbind(1)
         value = evaluator.exact(some, at)
-        inside = value <= 0
+        inside = value <= 0  # a root that is met exactly is a bracket, too
         low = torch.where(inside, low, at)
         high = torch.where(inside, at, high)
         bracketed = high < torch.inf
@@ -54,7 +54,7 @@ def refine(
         slope = torch.where(usable, secant, slope)
         step = -value / slope.clamp_max(-LEVEL_SLOPE)
         following = at + step
-        stays = ~bracketed | ((following > low) & (following < high))
+        stays = ~bracketed | ((following >= low) & (following <= high))
         following = torch.where(stays, following, (low + high) / 2)
         close = stays & (step.abs() < tolerance) & (value.abs() < ZERO * tolerance) & (bracketed | (slope < -SURE))
         closed = bracketed & usable & stays & (SECANT_ERROR * step.abs() < tolerance)
@@ -65,7 +65,7 @@ def refine(
         clear[active] = low
         evaluations[active] += 1
         rising = ~bracketed & (secant >= -LEVEL_SLOPE)
-        go = (~done & ~rising & (step.abs() < farthest)).nonzero()[:, 0]
+        go = (~done & ~rising & (bracketed | (step.abs() < farthest))).nonzero()[:, 0]
         if not len(go):
             break
         state = torch.stack([following, slope, low, high, at, value, farthest], dim=1)[go]

@@ -1,6 +1,7 @@
 """The default tracer: cells that may hold surface, cones of blocks of pixels, predicted roots, single rays."""
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -40,8 +41,9 @@ class TracerConfig:
     lipschitz: float | None = None
 
     def __post_init__(self) -> None:
-        if not self.tolerance > 0 or (self.lipschitz is not None and not 0 < self.lipschitz < float("inf")):
-            raise ValueError(f"{self} cannot trace: the tolerance and the Lipschitz constant must be positive")
+        given = [self.tolerance] if self.lipschitz is None else [self.tolerance, self.lipschitz]
+        if not all(0 < each < math.inf for each in given):
+            raise ValueError(f"{self} cannot trace: the tolerance and the Lipschitz constant must be positive, finite")
 
 
 @torch.no_grad()
@@ -54,12 +56,13 @@ def trace_images(
 ) -> tuple[Trace, Occupancy]:
     """Traces all pixels of a camera, or of a batch of them; the occupancy serves further views of the same field.
 
-    Raises `ValueError` for an occupancy of another radius, and for another number of cameras than of shapes.
+    Raises `ValueError` for an occupancy of another radius or number of shapes, and for another number of cameras than
+    of shapes.
     """
     camera = camera.detach()
     images = Images(camera, radius)
     evaluator, occupancy, setup = _prepared(sdf, images.eye, radius, config, occupancy)
-    if evaluator.shapes > 1 and evaluator.shapes != images.views:
+    if isinstance(sdf, BatchField) and evaluator.shapes != images.views:
         raise ValueError(
             f"a field of {evaluator.shapes} shapes and {images.views} cameras were given; give a camera for each shape"
         )
@@ -73,7 +76,10 @@ def trace_images(
         middle = batch
         batch, parent = images.split(batch, stride)
         if stride == 1:
-            predicted = _predicted(evaluator, middle, images, batch, parent)
+            batch, kept = _in_sphere(batch)
+            predicted = _predicted(evaluator, middle, images, batch, parent[kept])
+    if level == 0:
+        batch, _ = _in_sphere(batch)
     setup += evaluator.evaluations
     pixel = (batch.view * images.height + batch.row) * images.width + batch.column
     shape = torch.Size([*camera.intrinsics.shape[:-2], camera.height, camera.width])
@@ -96,12 +102,20 @@ def trace_rays(
     nothing = torch.zeros_like(start)
     width = nothing[:, None] + nothing.new_tensor([RAY_WIDTH, 0.0])
     everywhere = Batch(torch.zeros_like(index), index, index, unit.at(start), unit.directions, width, nothing, nothing)
-    batch = occupancy.entered(everywhere)
+    batch, _ = _in_sphere(occupancy.entered(everywhere))
     within = meet_sphere(Rays(everywhere.origins, everywhere.directions))
     nearest = -(everywhere.origins * everywhere.directions).sum(-1)
     beside = torch.where(within.meets, nearest.clamp(within.near, within.far), torch.inf)
     trace = _traced(evaluator, batch, None, config.tolerance)
     return _spread(trace, batch.row, beside, start, radius, setup), occupancy
+
+
+def _in_sphere(batch: Batch) -> tuple[Batch, Int[Tensor, "kept"]]:
+    """Rays cut off at the unit sphere, without those that miss it; and which they were."""
+    bounds = meet_sphere(Rays(batch.origins, batch.directions))
+    t, far = batch.t.maximum(bounds.near), batch.far.minimum(bounds.far)
+    kept = (t < far).nonzero()[:, 0]
+    return replace(batch, t=t, far=far)[kept], kept
 
 
 def _prepared(
@@ -112,6 +126,10 @@ def _prepared(
         occupancy = find_occupancy(evaluator, like, config.lipschitz)
     elif occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
+    elif len(occupancy.occupied) != evaluator.shapes:
+        raise ValueError(
+            f"an occupancy of {len(occupancy.occupied)} shapes was given with a field of {evaluator.shapes}; leave it out"
+        )
     setup, evaluator.evaluations = evaluator.evaluations, 0
     evaluator.normalise(occupancy.lipschitz)
     return evaluator, occupancy, setup
@@ -141,7 +159,8 @@ def _predicted(evaluator: Evaluator, middle: Batch, images: Images, batch: Batch
         change = torch.where(ahead.isnan(), inverse[parent] - behind, ahead - inverse[parent])
         total = total + torch.where(offset == 0, 0.0, change / BRANCH)
     root = 1 / total - shift[parent]
-    usable = ((root > batch.t) & (root - batch.t < PREDICTED)).nonzero()[:, 0]
+    enters = batch.t == meet_sphere(Rays(batch.origins, batch.directions)).near  # perhaps in the solid
+    usable = ((root > batch.t) & (root - batch.t < PREDICTED) & (root < batch.far) & ~enters).nonzero()[:, 0]
     low = batch.t[usable]
     return Roots(usable, root[usable], slope[parent[usable]], low, torch.full_like(low, torch.inf))
 
@@ -163,17 +182,19 @@ def _traced(evaluator: Evaluator, batch: Batch, predicted: Roots | None, toleran
         marched = march_rays(evaluate, some, steps, error=error, predict=predict)
         found = refine(evaluator, some, marched.roots, tolerance, LATER_LOOKS)
         at = ray[marched.roots.ray]
-        distance[at] = found.t
+        beyond = found.t > some.far[marched.roots.ray]
+        distance[at] = found.t.masked_fill(beyond, torch.nan)
         closest[ray] = marched.closest
         evaluations[ray] += marched.evaluations
         evaluations[at] += found.evaluations
-        missed = (found.t.isnan() & (found.clear < some.far[marched.roots.ray])).nonzero()[:, 0]
+        missed = (found.t.isnan() & ~beyond & (found.clear < some.far[marched.roots.ray])).nonzero()[:, 0]
         left = torch.cat([marched.stopped, marched.roots.ray[missed]])
         begins = ray[marched.inside]
         ray, some = ray[left], some[left].from_(torch.cat([marched.clear, found.clear[missed]]))
     outcome[ray] = int(Outcome.EXHAUSTED)
     outcome[begins] = int(Outcome.INSIDE)
-    passed = begins[(batch.t[begins] > 0) & (batch.at(batch.t)[begins].norm(dim=1) < 1)]
+    first = batch[begins]
+    passed = begins[first.t > meet_sphere(Rays(first.origins, first.directions)).near + tolerance]
     distance[passed] = _stepped_back(evaluator, batch[passed], tolerance)
     hit = ~distance.isnan()
     outcome = outcome.masked_fill(hit, int(Outcome.HIT))

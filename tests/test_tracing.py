@@ -1,0 +1,351 @@
+"""The default tracer: against closed forms, against a cautious march, and where what is thin or far away gets lost."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+
+from distrace import primitives
+from distrace.camera import Camera
+from distrace.checkpoint import load_model
+from distrace.errors import DoubtfulResult
+from distrace.evaluation.bench import poster_view, reference_distance
+from distrace.field import SDF, Counted
+from distrace.rays import Rays, meet_sphere
+from distrace.render import Buffers, render
+from distrace.trace import Outcome
+from distrace.tracing.evaluator import Evaluator
+from distrace.tracing.tracer import TracerConfig, trace_rays
+
+f64 = torch.float64
+P = primitives
+SOFA = P.union(P.box(torch.tensor([0.6, 0.15, 0.3])), P.box(torch.tensor([0.15, 0.5, 0.3])))
+
+
+def view(size: int = 48, azimuth: float = 30.0, elevation: float = 20.0, distance: float = 4.97, **more) -> Camera:
+    return Camera.orbit(azimuth, elevation, distance, height=size, width=size, **more)
+
+
+def sphere_distance(rays: Rays) -> Tensor:
+    bounds = meet_sphere(rays, 0.5)
+    return torch.where(bounds.meets, bounds.near, torch.inf)
+
+
+def box_distance(rays: Rays) -> Tensor:
+    half = torch.tensor([0.5, 0.3, 0.2], dtype=f64)
+    sides = torch.stack([(side - rays.origins) / rays.directions for side in (-half, half)])
+    enters, leaves = sides.amin(0).amax(-1), sides.amax(0).amin(-1)
+    return torch.where(enters < leaves, enters, torch.inf)
+
+
+def torus_distance(rays: Rays) -> Tensor:
+    """The least real root of (|p|² + R² − r²)² = 4 R² (p_x² + p_z²), a polynomial of degree four."""
+    major, minor = 0.5, 0.2
+    found = []
+    for o, v in zip(rays.origins.reshape(-1, 3).numpy(), rays.directions.reshape(-1, 3).numpy()):
+        near = -o @ v - 1
+        o = o + near * v
+        whole = np.poly1d([1, 2 * o @ v, o @ o + major**2 - minor**2])
+        flat = np.poly1d([v @ v - v[1] ** 2, 2 * (o @ v - o[1] * v[1]), o @ o - o[1] ** 2])
+        roots = (whole * whole - 4 * major**2 * flat).roots
+        real = [root.real + near for root in roots if abs(root.imag) < 1e-7]
+        found.append(min(real, default=np.inf))
+    return torch.tensor(found, dtype=f64).reshape(rays.shape)
+
+
+CLOSED = {
+    "sphere": (P.sphere(0.5), sphere_distance),
+    "box": (P.box(torch.tensor([0.5, 0.3, 0.2], dtype=f64)), box_distance),
+    "torus": (P.torus(0.5, 0.2), torus_distance),
+}
+
+
+@pytest.mark.parametrize("name", CLOSED)
+@pytest.mark.parametrize("azimuth", [30.0, 117.0])
+def test_a_solid_is_hit_where_its_closed_form_says(name: str, azimuth: float) -> None:
+    sdf, distance = CLOSED[name]
+    camera = view(azimuth=azimuth, dtype=f64)
+    true = distance(camera.rays())
+    buffers = render(sdf, camera)
+    seen = true.isfinite()
+    assert seen.sum() > 100
+    assert (buffers.mask != seen).sum() <= 2, "but for rays that touch the rim"
+    both = buffers.mask & seen
+    assert (buffers.distance - true)[both].abs().max() < 1e-3
+    assert (buffers.distance - true)[both].abs().median() < 5e-5
+
+
+def pixel_of(camera: Camera) -> float:
+    """The width of a pixel in the middle of the sphere."""
+    return float(camera.T_world_camera[:3, 3].norm() / camera.intrinsics[0, 0])
+
+
+def plate(width: float) -> SDF:
+    return P.box(torch.tensor([0.7, 0.5, width / 2]))
+
+
+def rod(width: float) -> SDF:
+    return P.capsule(torch.tensor([-0.6, -0.4, 0.3]), torch.tensor([0.5, 0.6, -0.2]), width / 2)
+
+
+def gap(width: float) -> SDF:
+    """Two walls with air between them."""
+    x = torch.tensor([0.3 + width / 2, 0.0, 0.0])
+    wall = P.box(torch.tensor([0.3, 0.6, 0.1]))
+    return P.union(lambda points: wall(points - x), lambda points: wall(points + x))
+
+
+THIN = {"plate": (plate, 92.0), "rod": (rod, 30.0), "gap": (gap, 5.0)}  # the plate nearly edge-on
+
+
+@pytest.mark.parametrize("name", THIN)
+@pytest.mark.parametrize("pixels", [1, 2, 3])
+def test_what_is_as_thin_as_a_pixel_is_not_lost(name: str, pixels: int) -> None:
+    make, azimuth = THIN[name]
+    camera = view(64, azimuth=azimuth)
+    sdf = make(pixels * pixel_of(camera))
+    rays = camera.rays()
+    true = reference_distance(sdf, rays, meet_sphere(rays)).isfinite()
+    with torch.no_grad():
+        found = render(sdf, camera).mask
+    assert true.sum() > 30
+    assert (true & ~found).sum() <= 0.01 * true.sum()
+    assert (found & ~true).sum() <= 0.01 * true.sum()
+
+
+def test_a_table_of_thin_legs_is_seen_through_a_squashed_field() -> None:
+    """tanh(15 f) is as steep as 15 at the surface and flat everywhere else."""
+    legs = [
+        P.capsule(torch.tensor([x, 0.3, z]), torch.tensor([x, -0.5, z]), 0.03) for x in (-0.5, 0.5) for z in (-0.3, 0.3)
+    ]
+    top = P.box(torch.tensor([0.6, 0.03, 0.4]))
+    table = P.union(lambda points: top(points - torch.tensor([0.0, 0.3, 0.0])), *legs)
+    camera = view(64)
+    rays = camera.rays()
+    true = reference_distance(table, rays, meet_sphere(rays)).isfinite()
+    with torch.no_grad():
+        found = render(lambda points: torch.tanh(15 * table(points)), camera).mask
+    assert true.sum() > 200
+    assert (true & ~found).sum() <= 0.02 * true.sum()
+    assert (found & ~true).sum() <= 0.02 * true.sum()
+
+
+def test_a_tiny_solid_off_the_centre_is_seen_by_a_long_lens() -> None:
+    centre = torch.tensor([0.31, -0.22, 0.17], dtype=f64)
+    eye = torch.tensor([3.0, 2.0, 3.5], dtype=f64)
+    camera = Camera.look_at(eye, centre, height=24, width=24, focal_px=24_000.0)
+    buffers = render(P.sphere(2e-3, centre), camera)
+    rays = camera.rays()
+    true = meet_sphere(Rays(rays.origins - centre, rays.directions), 2e-3)
+    assert true.meets.sum() > 50
+    assert (buffers.mask != true.meets).sum() <= 1
+    both = buffers.mask & true.meets
+    assert (buffers.distance - true.near)[both].abs().max() < 2.5e-4
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, f64])
+def test_a_camera_three_hundred_thousand_radii_away_sees_the_ball(dtype: torch.dtype) -> None:
+    camera = view(32, distance=3e5, focal_px=16 * 3e5, dtype=dtype)
+    buffers = render(P.sphere(0.5), camera)
+    share = float(buffers.mask.float().mean())
+    assert share == pytest.approx(torch.pi / 16, rel=0.15)
+    assert not (buffers.trace.outcome == Outcome.EXHAUSTED).any()
+
+
+@pytest.mark.filterwarnings("ignore::distrace.errors.DoubtfulResult")
+def test_a_camera_in_the_solid_is_told_so() -> None:
+    camera = Camera.look_at(torch.tensor([0.1, 0.0, 0.0]), torch.tensor([0.5, 0.0, 0.0]), height=8, width=8)
+    trace = render(P.sphere(0.5), camera).trace
+    assert (trace.outcome == Outcome.INSIDE).all()
+    assert (trace.distance == torch.inf).all()
+
+
+def test_a_camera_in_the_sphere_and_beside_the_solid_sees_it() -> None:
+    camera = Camera.orbit(40, 10, 0.8, height=16, width=16, focal_px=20.0, dtype=f64)
+    buffers = render(P.sphere(0.3), camera)
+    true = meet_sphere(camera.rays(), 0.3)
+    assert (buffers.mask == true.meets).all()
+    torch.testing.assert_close(buffers.distance[buffers.mask], true.near[true.meets], rtol=0, atol=2.5e-4)
+
+
+def test_a_surface_beyond_the_sphere_is_not_seen() -> None:
+    """The ball reaches out of the sphere: rays that enter the sphere in it are INSIDE, others see what is within."""
+    ball = P.sphere(0.5, torch.tensor([0.0, 0.0, 0.7], dtype=f64))
+    camera = view(32, azimuth=60.0, dtype=f64)
+    buffers = render(ball, camera)
+    rays = camera.rays()
+    true = reference_distance(ball, rays, meet_sphere(rays))
+    assert (buffers.trace.outcome == Outcome.INSIDE).sum() > 10
+    assert (buffers.mask == true.isfinite()).all()
+    assert buffers.points.norm(dim=1).max() <= 1 + 1e-6
+
+
+def test_a_field_of_nan_is_doubted_and_every_ray_exhausted() -> None:
+    camera = view(16)
+    with pytest.warns(DoubtfulResult, match="EXHAUSTED"):
+        trace = render(lambda points: torch.full_like(points[..., 0], torch.nan), camera).trace
+    outcome = trace.outcome[meet_sphere(camera.rays()).meets]
+    assert len(outcome) > 50
+    assert (outcome == Outcome.EXHAUSTED).all()
+    assert (trace.distance == torch.inf).all()
+    assert not trace.closest.isnan().any()
+
+
+def test_a_field_of_the_wrong_sign_is_doubted() -> None:
+    with pytest.warns(DoubtfulResult, match="inverted"):
+        trace = render(lambda points: 0.5 - points.norm(dim=-1), view(16)).trace
+    assert not trace.hit.any()
+
+
+def test_a_clean_picture_is_not_doubted(recwarn: pytest.WarningsRecorder) -> None:
+    for size in (33, 64, 128):
+        render(P.sphere(0.5), view(size))
+        render(SOFA, view(size))
+    assert not [warning for warning in recwarn if warning.category is DoubtfulResult]
+
+
+def test_a_scene_three_times_as_large_gives_the_same_picture() -> None:
+    camera, far = view(dtype=f64), view(distance=3 * 4.97, dtype=f64)
+    solid = P.box(torch.tensor([0.5, 0.3, 0.2], dtype=f64))
+    one = render(solid, camera)
+    three = render(lambda points: 3 * solid(points / 3), far, radius=3.0)
+    assert one.mask.any()
+    assert (one.trace.outcome == three.trace.outcome).all()
+    torch.testing.assert_close(three.distance, 3 * one.distance, rtol=0, atol=1e-9)
+    assert one.trace.total_evaluations == pytest.approx(three.trace.total_evaluations, rel=0.01)
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0])
+def test_a_field_of_scaled_values_gives_the_same_mask(factor: float) -> None:
+    camera = view(dtype=f64)
+    for sdf in (P.torus(0.5, 0.2), P.box(torch.tensor([0.5, 0.3, 0.2], dtype=f64))):
+        plain, scaled = render(sdf, camera), render(lambda points, sdf=sdf: factor * sdf(points), camera)
+        assert plain.mask.any()
+        assert (plain.mask == scaled.mask).all()
+        both = plain.mask
+        torch.testing.assert_close(scaled.distance[both], plain.distance[both], rtol=0, atol=2.5e-4)
+
+
+def three_shapes() -> tuple[Tensor, list[Camera], Camera]:
+    """Codes, and a camera of each, alone and in a batch."""
+    model = load_model("sofas")
+    cameras = [view(24, azimuth=azimuth) for azimuth in (0.0, 50.0, 200.0)]
+    batch = Camera.from_matrices(
+        torch.stack([camera.intrinsics for camera in cameras]),
+        torch.stack([camera.T_world_camera for camera in cameras]),
+        24,
+        24,
+    )
+    return model.codes[[0, 7, 30]], cameras, batch
+
+
+def test_a_batch_of_shapes_and_cameras_is_what_single_calls_give() -> None:
+    model = load_model("sofas")
+    codes, cameras, batch = three_shapes()
+    with torch.no_grad():
+        together = render(model.field(codes), batch)
+        assert together.mask.shape == (3, 24, 24)
+        for k, camera in enumerate(cameras):
+            alone = render(model.field(codes[k]), camera)
+            assert alone.mask.sum() > 20
+            assert (together.trace.outcome[k] == alone.trace.outcome).all()
+            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=1e-5)
+
+
+def test_the_gradients_of_a_batch_are_those_of_single_calls() -> None:
+    model = load_model("sofas")
+    codes, cameras, batch = three_shapes()
+    codes = codes.clone().requires_grad_()
+
+    def loss(buffers: Buffers) -> Tensor:
+        return buffers.depth[buffers.mask].sum()
+
+    (together,) = torch.autograd.grad(loss(render(model.field(codes), batch)), codes)
+    alone = sum(loss(render(model.field(codes[k]), camera)) for k, camera in enumerate(cameras))
+    assert isinstance(alone, Tensor)
+    (expected,) = torch.autograd.grad(alone, codes)
+    assert (expected.abs().amax(1) > 0).all()
+    torch.testing.assert_close(together, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
+
+
+@pytest.mark.parametrize("shapes", [1, 2])
+def test_another_number_of_cameras_than_of_shapes_is_refused(shapes: int) -> None:
+    codes, _, batch = three_shapes()
+    with pytest.raises(ValueError, match=f"field of {shapes} shapes and 3 cameras"):
+        render(load_model("sofas").field(codes[:shapes]), batch)
+
+
+def test_single_rays_see_what_the_image_sees() -> None:
+    camera = view(24, dtype=f64)
+    image = render(SOFA, camera)
+    trace, _ = trace_rays(SOFA, camera.rays().flat())
+    assert image.mask.sum() > 30
+    assert (trace.outcome.reshape(24, 24) == image.trace.outcome).all()
+    both = image.mask.reshape(-1)
+    torch.testing.assert_close(trace.distance[both], image.distance.reshape(-1)[both], rtol=0, atol=2.5e-4)
+
+
+def test_a_smaller_tolerance_is_kept() -> None:
+    camera = view(dtype=f64)
+    true = torus_distance(camera.rays())
+    errors = []
+    for tolerance in (1e-2, 1e-8):
+        buffers = render(P.torus(0.5, 0.2), camera, config=TracerConfig(tolerance=tolerance))
+        errors.append((buffers.distance - true)[buffers.mask & true.isfinite()].abs().max())
+    assert errors[1] < 1e-6 < errors[0]
+
+
+class Operations(TorchDispatchMode):
+    """Counts what PyTorch is asked to do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
+
+
+def counts_of(sdf: SDF, camera: Camera, monkeypatch: pytest.MonkeyPatch) -> Counter[str]:
+    """Operations, calls of the field and evaluations of one rendering."""
+    counts: Counter[str] = Counter()
+    at = Evaluator.at
+
+    def counted(self: Evaluator, points: Tensor, *args, **named) -> Tensor:
+        counts["calls"] += 1
+        counts["points"] += points.numel() // 3
+        return at(self, points, *args, **named)
+
+    monkeypatch.setattr(Evaluator, "at", counted)
+    with torch.no_grad(), Operations() as operations:
+        trace = render(sdf, camera).trace
+    monkeypatch.setattr(Evaluator, "at", at)
+    counts["operations"] = operations.count
+    counts["evaluations"] = trace.total_evaluations
+    counts["setup"] = trace.setup_evaluations
+    return counts
+
+
+def test_the_posters_view_takes_few_operations_and_few_calls_of_the_field(monkeypatch: pytest.MonkeyPatch) -> None:
+    sofa = load_model("sofas").field(0)
+    large = counts_of(sofa, poster_view(512), monkeypatch)
+    small = counts_of(sofa, poster_view(64), monkeypatch)
+    assert large["calls"] <= 60, large
+    assert large["operations"] <= 2000, large
+    assert large["points"] == large["evaluations"], "all are reported"
+    assert large["operations"] / small["operations"] < np.log(512) / np.log(64), (large, small)
+
+
+@pytest.mark.parametrize("name", ["box", "sofa"])
+def test_the_clearance_costs_no_more_than_the_render(name: str) -> None:
+    counted = Counted(SOFA if name == "box" else load_model("sofas").field(0))
+    with torch.no_grad():
+        buffers = render(counted, view(128))
+        rendered = counted.evaluations
+        assert buffers.clearance.isfinite().any()
+    assert rendered == buffers.trace.total_evaluations
+    assert counted.evaluations - rendered <= rendered
