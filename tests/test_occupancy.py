@@ -90,15 +90,14 @@ def test_a_lipschitz_constant_or_a_tolerance_that_bounds_nothing_is_refused(wron
 
 
 def test_the_occupancy_of_one_view_serves_another_and_saves_what_it_cost() -> None:
-    with torch.no_grad():
-        occupancy = render(BLOB, view()).occupancy
-        assert occupancy is not None
-        counted = Counted(BLOB)
-        alone = render(BLOB, view(azimuth=80.0))
-        again = render(counted, view(azimuth=80.0), occupancy=occupancy)
+    occupancy = render(BLOB, view()).occupancy
+    assert occupancy is not None
+    counted = Counted(BLOB)
+    alone = render(BLOB, view(azimuth=80.0))
+    again = render(counted, view(azimuth=80.0), occupancy=occupancy)
     assert again.occupancy is occupancy
     assert (again.trace.outcome == alone.trace.outcome).all()
-    torch.testing.assert_close(again.distance, alone.distance, rtol=0, atol=0)
+    torch.testing.assert_close(again.trace.distance, alone.trace.distance, rtol=0, atol=0)
     assert again.trace.total_evaluations == counted.evaluations
     assert alone.trace.total_evaluations - again.trace.total_evaluations == occupancy.evaluations > 4096
 

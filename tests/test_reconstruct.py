@@ -75,7 +75,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
 
 @pytest.fixture(scope="module")
 def views() -> list[Photograph]:
-    field, made = bumpy_balls().field(TRUE), []
+    field, made = bumpy_balls(0.35).field(TRUE), []
     for number, camera in enumerate(ring(8, 40)):
         with torch.no_grad():
             buffers = render(field, camera)

@@ -207,10 +207,6 @@ def minimum_and_value(
 
 def _differentiable(sdf: SDF, points: Tensor) -> bool:
     """Whether a gradient can reach anything: the points, or what the field was made from, which one value tells."""
-    return torch.is_grad_enabled() and (points.requires_grad or _first(sdf, points).requires_grad)
-
-
-def _first(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "one"]:
-    """The value at the first point, if there is any."""
-    some = points.detach().reshape(-1, 3)[:1]
-    return at_rows(sdf, torch.arange(len(some), device=some.device))(some)
+    first = points.detach().reshape(-1, 3)[:1]
+    field = at_rows(sdf, torch.arange(len(first), device=points.device))
+    return torch.is_grad_enabled() and (points.requires_grad or field(first).requires_grad)

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor
 
 from distrace.batch_field import BatchField
@@ -17,7 +17,7 @@ from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import BRANCH, Images, reach
 from distrace.tracing.march import march_cones, march_rays
-from distrace.tracing.roots import Roots, refine
+from distrace.tracing.roots import Found, Roots, refine
 
 TOP = 0.03  # radii: the cones of the largest blocks reach no farther; half a cell of the occupancy
 CONE_STEPS = 8  # of each level
@@ -127,8 +127,9 @@ def _prepared(
     elif occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
     elif len(occupancy.occupied) != evaluator.shapes:
+        given = len(occupancy.occupied)
         raise ValueError(
-            f"an occupancy of {len(occupancy.occupied)} shapes was given with a field of {evaluator.shapes}; leave it out"
+            f"an occupancy of {given} shapes was given with a field of {evaluator.shapes}; leave the occupancy out"
         )
     setup, evaluator.evaluations = evaluator.evaluations, 0
     evaluator.normalise(occupancy.lipschitz)
@@ -189,25 +190,28 @@ def _traced(evaluator: Evaluator, batch: Batch, predicted: Roots | None, toleran
         evaluations[at] += found.evaluations
         missed = (found.t.isnan() & ~beyond & (found.clear < some.far[marched.roots.ray])).nonzero()[:, 0]
         left = torch.cat([marched.stopped, marched.roots.ray[missed]])
-        begins = ray[marched.inside]
+        begins, first = ray[marched.inside], some[marched.inside]
         ray, some = ray[left], some[left].from_(torch.cat([marched.clear, found.clear[missed]]))
     outcome[ray] = int(Outcome.EXHAUSTED)
     outcome[begins] = int(Outcome.INSIDE)
-    first = batch[begins]
-    passed = begins[first.t > meet_sphere(Rays(first.origins, first.directions)).near + tolerance]
-    distance[passed] = _stepped_back(evaluator, batch[passed], tolerance)
+    past = (first.t > meet_sphere(Rays(first.origins, first.directions)).near + tolerance).nonzero()[:, 0]
+    passed = begins[past]
+    back = _stepped_back(evaluator, first[past], tolerance)
+    distance[passed] = back.t
+    evaluations[passed] += back.evaluations
     hit = ~distance.isnan()
     outcome = outcome.masked_fill(hit, int(Outcome.HIT))
     closest = torch.where(hit, distance, closest)
     return Trace(distance.masked_fill(~hit, torch.inf), outcome, closest, closest, evaluations)
 
 
-def _stepped_back(evaluator: Evaluator, batch: Batch, tolerance: float) -> Float[Tensor, "n"]:
+def _stepped_back(evaluator: Evaluator, batch: Batch, tolerance: float) -> Found:
     """Roots of rays that a ball too large, where f is steeper than the bound, has led into the solid."""
     index = torch.arange(len(batch), device=batch.t.device)
     value = evaluator.exact(batch, batch.t)
     roots = Roots(index, batch.t + value, -torch.ones_like(value), batch.t + 4 * value, batch.t)
-    return refine(evaluator, batch, roots, tolerance, LATER_LOOKS).t
+    found = refine(evaluator, batch, roots, tolerance, LATER_LOOKS)
+    return replace(found, evaluations=found.evaluations + 1)
 
 
 def _spread(trace: Trace, ray: Tensor, beside: Tensor, shift: Tensor, radius: float, setup: int) -> Trace:
