@@ -12,7 +12,7 @@ APART = 1e-2  # of a cell's width: over which
 
 @torch.no_grad()
 def typical_slope(sdf: SDF, like: Tensor, radius: float = 1.0) -> tuple[float, int]:
-    """The median of |∇f| at corners of a coarse lattice in the sphere that are, by |f| / |∇f|, within a cell of a zero.
+    """The median of |∇f| at corners of a coarse grid in the sphere that are, by |f| / |∇f|, within a cell of a zero.
 
     And how many evaluations that took. 0 where no zero seems near any: what it says of itself tells, whatever the
     field's scale.

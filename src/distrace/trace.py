@@ -69,7 +69,7 @@ class Trace(ByValue):
     closest: Float[Tensor, "*batch"]  # the distance at which |sdf| was least
     stopped: Float[Tensor, "*batch"]  # where the march stood when it ended, whatever the outcome
     evaluations: Int[Tensor, "*batch"]  # of the field, for this ray
-    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels, a lattice
+    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels; an octree and blocks of pixels
 
     @property
     def hit(self) -> Bool[Tensor, "*batch"]:

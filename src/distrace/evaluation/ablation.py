@@ -1,4 +1,4 @@
-"""The rows of the benchmark of tracing: the strategies of DIST, what its original code costs, and fast."""
+"""Rows of the tracing benchmark: DIST's strategies, its original code, and the default tracer (fast)."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
@@ -31,7 +31,7 @@ def of_field(
 
 
 def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
-    """The ablation on a decoder; what the original costs; and what fast costs once an image of the shape is there."""
+    """The strategies and DIST's original code on a decoder, and the default tracer on the next view of the shape."""
     sdf, latent = model.field(code), model.codes[code]
     cases = list(of_field(sdf, camera))
     yield from cases[:-1]

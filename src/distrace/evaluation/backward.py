@@ -27,7 +27,7 @@ class Timing:
 
 
 def timings(model: Model, code: int, camera: Camera, repeats: int) -> list[Timing]:
-    """A depth image by `fast` and its backward pass, for the code and for the camera, in turn after one to warm up."""
+    """Times a depth image by the default tracer and its backward pass, by code and by camera, after a warm-up run."""
     ways = {"code": partial(_by_code, model, code, camera), "camera": partial(_by_camera, model, code, camera)}
     taken: dict[str, list[tuple[float, float, int]]] = {name: [] for name in ways}
     for _ in range(repeats + 1):

@@ -1,4 +1,4 @@
-"""How the cost of fast grows: with the size of the image, of the field, and with the number of views."""
+"""How the default tracer's cost grows with the sizes of image and network, and with the number of views."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass

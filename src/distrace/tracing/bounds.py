@@ -1,4 +1,4 @@
-"""Where a surface can be: an octree of cell centres, each excludes a ball by the field's Lipschitz constant."""
+"""Where a surface can be: an octree of cell centres, each of which excludes a ball by a Lipschitz constant of f."""
 
 from dataclasses import dataclass, replace
 
@@ -30,7 +30,7 @@ class Occupancy:
     evaluations: int
 
     def entered(self, batch: Batch) -> Batch:
-        """Rays from the first to the last cell on their way that may hold surface; others are left out."""
+        """Rays from the first to the last cell on their way that may hold surface, without those that meet none."""
         rays = Rays(batch.origins, batch.directions)
         cells = self.occupied.shape[-1]
         bounds = meet_sphere(rays, 1 + 2 / cells)

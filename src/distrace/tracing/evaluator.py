@@ -1,4 +1,4 @@
-"""The field as the tracer evaluates it: in the unit sphere, of one shape or more, exactly or roughly; counted."""
+"""The field as the tracer evaluates it: in the unit sphere, of one shape or several, exactly or roughly, counted."""
 
 from collections.abc import Callable
 
@@ -28,7 +28,7 @@ class Evaluator:
         cheap = rough_field(sdf)
         self.cheap = sdf if cheap is None else cheap
         self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
-        self.scale: Float[Tensor, shapes] | None = None
+        self.scale: Tensor | None = None  # [shapes]
         self.evaluations = 0
 
     def exact(self, batch: Batch, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:

@@ -43,7 +43,8 @@ class Images:
         """All blocks of `stride` pixels a side."""
         counts = (self.views, -(-self.height // stride), -(-self.width // stride))
         index = [torch.arange(count, device=self.eye.device) for count in counts]
-        return self._batch(*torch.cartesian_prod(*index).unbind(1), stride)
+        view, row, column = torch.cartesian_prod(*index).unbind(1)
+        return self._batch(view, row, column, stride)
 
     def beside(self) -> Float[Tensor, "pixels"]:
         """How far the ray of each pixel goes to pass the middle of the sphere; infinite where it misses the sphere."""

@@ -16,7 +16,6 @@ GAP = 2e-3  # radii, at most, by which a step is longer than f, where the slope 
 GAP_MOST = 1e-2  # … twice as much with every step after which the slope is what it was, to BEND; up to this
 BEND = 0.1
 LEVEL = 0.05  # slope below which a ray counts as parallel to the surface
-GROWTH = 1.1  # of the steps that are evaluated at once
 
 
 @dataclass(frozen=True)
@@ -76,7 +75,7 @@ def march_rays(
     active = torch.arange(len(t), device=t.device)
     value = evaluate(batch, t)
     doubtful = ~(value > error)
-    inside = (value < -error).nonzero()[:, 0]
+    inside = (value <= -error).nonzero()[:, 0]
     least, closest = value.clone(), t.clone()
     evaluations = torch.ones_like(active)
     stopped, clear = [active[doubtful]], [t[doubtful]]
@@ -90,11 +89,11 @@ def march_rays(
         t, value, last_slope, gap = state[go].unbind(1)
         longest = value / (0.9 * last_slope.abs().clamp_min(LEVEL))
         length = torch.minimum(value + gap, longest.maximum(value)).maximum(0.1 * gap)
-        lengths = length * GROWTH ** torch.arange(count, device=t.device, dtype=t.dtype)[:, None]
-        times = torch.cat([t[None], t + lengths.cumsum(0)])
+        order = torch.arange(count + 1, device=t.device, dtype=t.dtype)[:, None]
+        times = t + order * length
         ahead = evaluate(some, times[1:])
         values = torch.cat([value[None], ahead])
-        allowed = lengths <= values[:-1] + gap * (1 + 1e-5)
+        allowed = length <= values[:-1] + 1.5 * gap
         last = ((ahead > error) & allowed).long().cumprod(0).sum(0).clamp_max(count - 1)[None]
         value, ahead, allowed = (rows.gather(0, last)[0] for rows in (values, ahead, allowed))
         t, following = (times.gather(0, at)[0] for at in (last, last + 1))

@@ -20,12 +20,12 @@ from distrace.tracing.march import march_cones, march_rays
 from distrace.tracing.roots import Found, Roots, refine
 
 TOP = 0.03  # radii: the cones of the largest blocks reach no farther; half a cell of the occupancy
-CONE_STEPS = 4  # of each level
+CONE_STEPS = 8  # of each level
 MIDDLE_STEPS = (1, 1, 1)  # of the middle rays from which the pixels around them are predicted
 RAY_WIDTH = 0.01  # radii: the footprint of rays that are no pixels
-PREDICTED = 1e-2  # radii before a root that the pixels around predict, at most, that may stay unchecked
-STEPS = (1,) * 7 + (4,) * 2  # of single rays by rough values
-LATER_STEPS = (1,) * 6 + (4,) * 4 + (8,) * 40  # by exact values, of rays that graze the surface
+PREDICTED = 2e-2  # radii before a root that the pixels around predict, at most, that may stay unchecked
+STEPS = (1,) * 9 + (2,) * 3  # of single rays by rough values
+LATER_STEPS = (1,) * 8 + (2,) * 4 + (4,) * 4 + (8,) * 40  # by exact values, of rays that graze the surface
 LOOKS = 3  # at a root that was predicted from the pixels around …
 LATER_LOOKS = 6  # … and by a ray's own march
 
@@ -92,7 +92,7 @@ def trace_images(
 def trace_rays(
     sdf: SDF, rays: Rays, radius: float = 1.0, config: TracerConfig = TracerConfig(), occupancy: Occupancy | None = None
 ) -> tuple[Trace, Occupancy]:
-    """The same for rays that are no image [n]: each is marched on its own. Raises `ValueError` as that does."""
+    """The same for rays [n] that are no image: each is marched on its own. Raises `ValueError` as `trace_images`."""
     rays = rays.detach()
     evaluator, occupancy, setup = _prepared(sdf, rays.directions, radius, config, occupancy)
     unit = Rays(rays.origins / radius, rays.directions)
