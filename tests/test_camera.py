@@ -326,8 +326,7 @@ def things() -> list[object]:
     """One of each class, made anew."""
     camera = Camera.orbit(30, 20, 3, height=2, width=3)
     bounds, one = meet_sphere(camera.rays()), torch.ones(2, 3)
-    slope = torch.full((2, 3), math.nan)
-    trace = Trace(one * math.inf, one.long(), one, one, one.long(), slope=slope)
+    trace = Trace(one * math.inf, one.long(), one, one, one.long())
     return [camera, camera.rays(), bounds, trace]
 
 
@@ -353,4 +352,4 @@ def test_what_differs_in_one_value_or_in_precision_is_not_equal() -> None:
     assert {rays: 1}[Rays(rays.origins.clone(), rays.directions.clone())] == 1
     trace = things()[3]
     assert isinstance(trace, Trace)
-    assert trace != replace(trace, slope=None)
+    assert trace != replace(trace, setup_evaluations=1)
