@@ -49,10 +49,7 @@ class Images:
     def beside(self) -> Float[Tensor, "pixels"]:
         """How far the ray of each pixel goes to pass the middle of the sphere; infinite where it misses the sphere."""
         pixels = self.blocks(1)
-        rays = Rays(pixels.origins, pixels.directions)
-        bounds = meet_sphere(rays)
-        nearest = -(rays.origins * rays.directions).sum(-1)
-        return torch.where(bounds.meets, nearest.clamp(bounds.near, bounds.far), torch.inf)
+        return beside_middle(Rays(pixels.origins, pixels.directions))
 
     def split(self, batch: Batch, stride: int) -> tuple[Batch, Int[Tensor, "m"]]:
         """The nine parts of each block, where they show something of the image, and the block of each.
@@ -84,3 +81,10 @@ class Images:
 def reach(stride: int) -> float:
     """From the middle of a block to the middle of its farthest pixel, in pixels."""
     return (stride - 1) / 2**0.5
+
+
+def beside_middle(rays: Rays) -> Float[Tensor, "*batch"]:
+    """How far each ray goes to pass the middle of the unit sphere; infinite where it misses the sphere."""
+    bounds = meet_sphere(rays)
+    nearest = -(rays.origins * rays.directions).sum(-1)
+    return torch.where(bounds.meets, nearest.clamp(bounds.near, bounds.far), torch.inf)

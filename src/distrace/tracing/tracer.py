@@ -15,7 +15,7 @@ from distrace.trace import Outcome, Trace
 from distrace.tracing.batch import Batch
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator
-from distrace.tracing.images import BRANCH, Images, reach
+from distrace.tracing.images import BRANCH, Images, beside_middle, reach
 from distrace.tracing.march import march_cones, march_rays
 from distrace.tracing.roots import Found, Roots, refine
 
@@ -103,9 +103,7 @@ def trace_rays(
     width = nothing[:, None] + nothing.new_tensor([RAY_WIDTH, 0.0])
     everywhere = Batch(torch.zeros_like(index), index, index, unit.at(start), unit.directions, width, nothing, nothing)
     batch, _ = _in_sphere(occupancy.entered(everywhere))
-    within = meet_sphere(Rays(everywhere.origins, everywhere.directions))
-    nearest = -(everywhere.origins * everywhere.directions).sum(-1)
-    beside = torch.where(within.meets, nearest.clamp(within.near, within.far), torch.inf)
+    beside = beside_middle(Rays(everywhere.origins, everywhere.directions))
     trace = _traced(evaluator, batch, None, config.tolerance)
     return _spread(trace, batch.row, beside, start, radius, setup), occupancy
 
