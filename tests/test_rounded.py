@@ -95,11 +95,12 @@ def test_a_batch_of_codes_of_another_length_is_refused(model, form) -> None:
         form(model.decoder).field(torch.zeros(3, 7))
 
 
-def test_laid_out_weights_give_what_autocast_gives(model) -> None:
+def test_laid_out_weights_are_as_right_as_autocast(model) -> None:
     points = torch.rand(500, 3, generator=torch.Generator().manual_seed(5)) - 0.5
-    found, usual = (form(model.decoder).field(model.codes[1])(points) for form in (LaidOut, Rounded))
+    exact = model.field(1)(points)
+    found, usual = (form(model.decoder).field(model.codes[1])(points) - exact for form in (LaidOut, Rounded))
     torch.testing.assert_close(found, usual, atol=2e-3, rtol=0)
-    assert (found == usual).float().mean() > 0.98
+    assert 0 < found.square().mean() < 1.1 * usual.square().mean()
 
 
 @pytest.mark.parametrize("use_tanh", [False, True])

@@ -142,10 +142,8 @@ def test_a_tiny_solid_off_the_centre_is_seen_by_a_long_lens() -> None:
     buffers = render(P.sphere(2e-3, centre), camera)
     rays = camera.rays()
     true = meet_sphere(Rays(rays.origins - centre, rays.directions), 2e-3)
-    passes = torch.linalg.cross(rays.origins - centre, rays.directions).norm(dim=-1) - 2e-3
     assert true.meets.sum() > 50
-    assert passes[buffers.mask != true.meets].abs().max() < 1e-4, "rays by the rim, within the tolerance of a hit"
-    assert (buffers.mask != true.meets).sum() <= 0.05 * true.meets.sum()
+    assert (buffers.mask != true.meets).sum() <= 1
     both = buffers.mask & true.meets
     assert (buffers.distance - true.near)[both].abs().max() < 2.5e-4
 
@@ -256,7 +254,7 @@ def test_a_batch_of_shapes_and_cameras_is_what_single_calls_give() -> None:
             alone = render(model.field(codes[k]), camera)
             assert alone.mask.sum() > 20
             assert (together.trace.outcome[k] == alone.trace.outcome).all()
-            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=3e-5)
+            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=1e-4)
 
 
 def test_the_gradients_of_a_batch_are_those_of_single_calls() -> None:
@@ -354,17 +352,15 @@ def test_all_evaluations_of_the_posters_view_are_reported(counts) -> None:
     assert counts[512]["points"] == counts[512]["evaluations"] > 100_000
 
 
-@pytest.mark.xfail(strict=True, reason="72 calls; 67 without products in bfloat16")
 def test_the_posters_view_takes_few_calls_of_the_field(counts) -> None:
     assert counts[512]["calls"] <= 60
 
 
-@pytest.mark.xfail(strict=True, reason="8,618 operations, a third of them the network's own; 7,562 without bfloat16")
+@pytest.mark.xfail(strict=True, reason="2,413 operations")
 def test_the_posters_view_takes_few_operations(counts) -> None:
     assert counts[512]["operations"] <= 2000
 
 
-@pytest.mark.xfail(strict=True, reason="8,618 against 5,362 at 64 × 64: × 1.61, where the logarithms are × 1.5")
 def test_operations_grow_no_faster_than_the_logarithm_of_the_images_side(counts) -> None:
     assert counts[512]["operations"] / counts[64]["operations"] < np.log(512) / np.log(64)
 

@@ -107,13 +107,21 @@ class Camera(ByValue):
 
     def rays(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Rays:
         """The rays through pixel positions, by default all centres: [*batch, height, width]."""
+        return self.sight(pixels)[0]
+
+    def sight(
+        self, pixels: Float[Tensor, "*pixels 2"] | None = None
+    ) -> tuple[Rays, Float[Tensor, "*batch_pixels"], Float[Tensor, "*batch_pixels"]]:
+        """`rays`, `cosines` and `pixel_angle` at once."""
         pixels = self.pixels() if pixels is None else pixels
         batch, axes = self.intrinsics.shape[:-2], (1,) * (pixels.dim() - 1)
         rotation = self.T_world_camera[..., :3, :3].reshape(*batch, *axes, 3, 3)
         ahead = self._ahead(pixels)
-        directions = (rotation @ (ahead / ahead.norm(dim=-1, keepdim=True))[..., None])[..., 0]
+        depth_one = ahead.norm(dim=-1)
+        directions = (rotation @ (ahead / depth_one[..., None])[..., None])[..., 0]
         origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
-        return Rays(origins, directions)
+        focal = self.intrinsics[..., 0, 0].reshape(*batch, *axes)
+        return Rays(origins, directions), 1 / depth_one, 1 / (depth_one.square() * focal)
 
     def project(self, points_world: Float[Tensor, "*points 3"]) -> tuple[Tensor, Tensor]:
         """Pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""
@@ -137,10 +145,7 @@ class Camera(ByValue):
 
     def pixel_angle(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
         """The width that a pixel covers at a distance of 1: cos²θ / f, θ from the optical axis, f in pixels."""
-        pixels = self.pixels() if pixels is None else pixels
-        axes = (1,) * (pixels.dim() - 1)
-        focal = self.intrinsics[..., 0, 0].reshape(*self.intrinsics.shape[:-2], *axes)
-        return self.cosines(pixels) ** 2 / focal
+        return self.sight(pixels)[2]
 
     def tolerance(self, least_depth: float) -> Float[Tensor, "*batch height width"]:
         """DIST's convergence criterion: half the distance of what neighbouring pixels see at the least depth.

@@ -47,17 +47,28 @@ class Product(NamedTuple):
             return Product(bias, weight, None)
         return Product(bias, weight[:-3] if len(weight) > 3 else None, weight[-3:])
 
-    def of_inputs(self, units: Tensor, points: Tensor, shape: Tensor | None, out: Tensor | None = None) -> Tensor:
-        """The layer's outputs, with the bias of each point's shape; written to `out`, if given."""
+    def bent(self, units: Tensor, points: Tensor, shape: Tensor | None, out: Tensor) -> Tensor:
+        """The layer's outputs after a ReLU, with the bias of each point's shape, written to `out`."""
+        outputs, (x, weight) = self._begun(units, points, shape, out)
+        return torch._addmm_activation(outputs, x, weight, out=out)
+
+    def ended(self, units: Tensor, points: Tensor, shape: Tensor | None) -> Float[Tensor, "n"]:
+        """The one output of a last layer."""
+        outputs, (x, weight) = self._begun(units, points, shape, None)
+        return torch.addmm(outputs, x, weight)[:, 0]
+
+    def _begun(
+        self, units: Tensor, points: Tensor, shape: Tensor | None, out: Tensor | None
+    ) -> tuple[Tensor, tuple[Tensor, Tensor]]:
+        """The bias, with all products but one, and what that one is of."""
         left = [(x, weight) for x, weight in ((points, self.points), (units, self.units)) if weight is not None]
+        outputs = self.bias
         if self.bias.dim() == 2:
             assert shape is not None
             outputs = torch.index_select(self.bias, 0, shape, out=out)
-        else:
-            outputs = torch.addmm(self.bias, *left.pop(0), out=out)
-        for x, weight in left:
-            outputs.addmm_(x, weight)
-        return outputs
+        for x, weight in left[:-1]:
+            outputs = torch.addmm(outputs, x, weight, out=out)
+        return outputs, left[-1]
 
 
 @torch.no_grad()
@@ -77,8 +88,8 @@ def evaluated(
             side, width = number % 2, product.bias.shape[-1]
             if (side, width) not in views:
                 views[side, width] = buffer.as_strided((count, width), (width, 1), side * count * widest)
-            units = product.of_inputs(units, points, shape, views[side, width]).relu_()
-        return last.of_inputs(units, points, shape)[:, 0]
+            units = product.bent(units, points, shape, views[side, width])
+        return last.ended(units, points, shape)
 
 
 @contextmanager

@@ -200,7 +200,7 @@ def render(
     """
     if not 0 < radius < math.inf:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive, finite radius")
-    rays = camera.rays()
+    rays, cosines, angle = camera.sight()
     if isinstance(config, TracerConfig):
         trace, occupancy = trace_images(sdf, camera, radius, config, occupancy)
     elif isinstance(sdf, BatchField):
@@ -208,7 +208,7 @@ def render(
     else:
         trace, occupancy = _marched(sdf, camera, rays, radius, config.within(radius)), None
     _warn(trace)
-    return Buffers(sdf, rays, camera.cosines(), trace, radius, occupancy, camera.pixel_angle())
+    return Buffers(sdf, rays, cosines, trace, radius, occupancy, angle)
 
 
 def _marched(sdf: SDF, camera: Camera, rays: Rays, radius: float, config: TraceConfig) -> Trace:
@@ -243,6 +243,6 @@ def render_rays(
     sdf: SDF, camera: Camera, pixels: Float[Tensor, "n 2"], *, radius: float = 1.0, config: TraceConfig = TraceConfig()
 ) -> Buffers:
     """The same for some pixel positions (x, y) alone: what a loss on sparse observations needs. No coarse levels."""
-    rays = camera.rays(pixels)
+    rays, cosines, angle = camera.sight(pixels)
     trace = sphere_trace(sdf, rays, meet_sphere(rays.detach(), radius), config.within(radius))
-    return Buffers(sdf, rays, camera.cosines(pixels), trace, radius, pixel=camera.pixel_angle(pixels))
+    return Buffers(sdf, rays, cosines, trace, radius, pixel=angle)

@@ -3,7 +3,7 @@
 from functools import partial
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -13,7 +13,7 @@ from distrace.field import SDF, flattened, in_chunks
 from distrace.products import Layer
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
-CHUNK = 4096  # points at a time: each product's output is fresh memory; 65,536 at a time take twice as long
+CHUNK = 32_768  # points at a time: each product's output is fresh memory; 65,536 at a time take twice as long
 
 
 class Rounded:
@@ -64,8 +64,9 @@ class Rounded:
         self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None
     ) -> Float[Tensor, "n"]:
         if shape is not None:
-            shape = pad(shape, (0, -len(shape) % ROWS))
-        return self._run(layers, filled(points), shape)[: len(points)].float()
+            shape = filled(shape)
+        values = self._run(layers, filled(points), shape).float()
+        return values if len(values) == len(points) else values[: len(points)]
 
     def _run(
         self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
@@ -76,6 +77,7 @@ class Rounded:
             return self.decoder._run(layers, points)
 
 
-def filled(rows: Float[Tensor, "n width"]) -> Float[Tensor, "m width"]:
+def filled(rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "m *_"]:
     """With rows of zeros after them, up to a multiple of `ROWS`."""
-    return pad(rows, (0, 0, 0, -len(rows) % ROWS))
+    missing = -len(rows) % ROWS
+    return pad(rows, (0, 0) * (rows.dim() - 1) + (0, missing)) if missing else rows

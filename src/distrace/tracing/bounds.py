@@ -1,15 +1,15 @@
 """Where a surface can be: an octree of cell centres, each of which excludes a ball by a Lipschitz constant of f."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
-from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.tracing.batch import Batch
+from distrace.rays import Bounds, Rays
 from distrace.tracing.evaluator import Evaluator
+from distrace.tracing.images import Lines
 
 CELLS = 16  # along the diameter of the unit sphere; those that may hold surface are split once
 HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
@@ -29,24 +29,26 @@ class Occupancy:
     radius: float
     evaluations: int
 
-    def entered(self, batch: Batch) -> Batch:
-        """Rays from the first to the last cell on their way that may hold surface, without those that meet none."""
-        rays = Rays(batch.origins, batch.directions)
+    def entered(self, lines: Lines) -> Float[Tensor, "2 n"]:
+        """From the first to the last cell on the way of each ray that may hold surface; from inf to −inf if none does.
+
+        Cells are looked at by samples along the ray.
+        """
         cells = self.occupied.shape[-1]
-        bounds = meet_sphere(rays, 1 + 2 / cells)
-        index = bounds.meets.nonzero()[:, 0]
-        batch, near, far = batch[index], bounds.near[index], bounds.far[index]
-        apart = (far - near) / SAMPLES
-        steps = torch.arange(SAMPLES, device=near.device) + 0.5
-        points = batch.at(near + steps[:, None] * apart)
-        x, y, z = ((points + 1) * (cells / 2)).long().clamp_(0, cells - 1).unbind(-1)
-        shape = batch.view if len(self.occupied) > 1 else torch.zeros_like(batch.view)
-        held = self.occupied[shape, x, y, z]
-        order = torch.arange(1, SAMPLES + 1, device=near.device)[:, None]
-        last = (held * order).amax(0)
-        first = SAMPLES - (held * order.flip(0)).amax(0)
-        within = replace(batch, t=near + first * apart, far=near + last * apart)
-        return within[(last > 0).nonzero()[:, 0]]
+        middle = lines.middle()
+        nearest = lines.at(middle).square().sum(1)
+        half = ((1 + 2 / cells) ** 2 - nearest).clamp_min(0).sqrt()
+        near = (middle - half).clamp_min(0)
+        apart = (middle + half - near).clamp_min(0) / SAMPLES
+        order = torch.arange(SAMPLES, dtype=near.dtype, device=near.device)[:, None]
+        cell = ((lines.at(torch.addcmul(near, order + 0.5, apart)) + 1) * (cells / 2)).long().clamp_(0, cells - 1)
+        place = cell @ cell.new_tensor([cells * cells, cells, 1])
+        if len(self.occupied) > 1 and lines.view is not None:
+            place = place + lines.view * cells**3
+        held = self.occupied.reshape(-1)[place]
+        first = torch.where(held, order, torch.inf).amin(0)
+        last = torch.where(held, order + 1, -torch.inf).amax(0)
+        return torch.addcmul(near, torch.stack([first, last]), apart)
 
     @torch.no_grad()
     def lowest(self, rays: Rays, bounds: Bounds, shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
@@ -74,47 +76,47 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     gradient in the cells nearest to the surface. Cells deep in the solid stay occupied: rays may start there.
     """
     shapes, width = evaluator.shapes, 2 / CELLS
-    along = (torch.arange(CELLS, dtype=like.dtype, device=like.device) + 0.5) * width - 1
+    along = torch.arange(-1 + width / 2, 1, width, dtype=like.dtype, device=like.device)
     centres = torch.cartesian_prod(along, along, along)
+    signs = like.new_tensor([-1, 1])
+    corners = torch.cartesian_prod(signs, signs, signs)  # of a cell, and where the parts of a block of cells are
     shape = torch.arange(shapes, device=like.device)
-    values = evaluator.at(centres.repeat(shapes, 1), shape.repeat_interleave(len(centres)), rough=True).reshape(
-        shapes, -1
-    )
+    values = evaluator.at(centres.repeat(shapes, 1), shape.repeat_interleave(len(centres)), rough=True)
+    coarse = values.reshape(shapes, *[CELLS] * 3)
     if lipschitz is None:
-        blocks = values.reshape(shapes, *[CELLS] * 3).unfold(1, 2, 2).unfold(2, 2, 2).unfold(3, 2, 2)
-        steepest = _mean_slope(blocks, width).flatten(1).amax(1)
-        bound = MARGIN * steepest.maximum(_steep_gradient(evaluator, centres, values, width / 64))
+        blocks = coarse.unfold(1, 2, 2).unfold(2, 2, 2).unfold(3, 2, 2).reshape(shapes, -1, 8)
+        steepest = _mean_slope(blocks, corners, width).amax(1)
+        bound = MARGIN * steepest.maximum(_steep_gradient(evaluator, centres, coarse.flatten(1), width / 64))
     else:
         bound = like.new_full((shapes,), lipschitz)
-    reach = (width * HALF_DIAGONAL) * bound[:, None]
-    possible = ~(values > reach)  # also where the field gives NaN
-    shape, cell = (possible & ~(values < -reach)).nonzero().unbind(1)
-    children = centres[cell][:, None] + torch.cartesian_prod(*[like.new_tensor([-width / 4, width / 4])] * 3)
+    reach = width * HALF_DIAGONAL * bound
+    excluded = coarse > reach[:, None, None, None]  # where the field gives NaN nothing is
+    uncertain = ~excluded & ~(coarse < -reach[:, None, None, None])
+    shape, cell = uncertain.flatten(1).nonzero().unbind(1)
+    children = centres[cell][:, None] + width / 4 * corners
     whose = shape.repeat_interleave(8)
     fine = evaluator.at(children.reshape(-1, 3), whose, rough=True)
     if lipschitz is None:
-        bound = bound.scatter_reduce(0, shape, MARGIN * _mean_slope(fine.reshape(-1, 2, 2, 2), width / 2), "amax")
-    occupied = possible.reshape(shapes, *[CELLS] * 3)
-    occupied = occupied.repeat_interleave(2, 1).repeat_interleave(2, 2).repeat_interleave(2, 3)
-    x, y, z = ((children + 1) * CELLS).long().reshape(-1, 3).unbind(-1)
-    occupied[whose, x, y, z] = ~(fine > (width / 2 * HALF_DIAGONAL) * bound[whose])
-    beside = F.max_pool3d(occupied[:, None].to(like.dtype), 3, 1, 1)[:, 0] > 0
-    coarse = values.reshape(shapes, *[CELLS] * 3)
+        bound = bound.scatter_reduce(0, shape, MARGIN * _mean_slope(fine.reshape(-1, 8), corners, width / 2), "amax")
+    occupied = F.interpolate((~excluded).to(like.dtype)[:, None], scale_factor=2.0)[:, 0]
+    x, y, z = ((children + 1) * CELLS).long().reshape(-1, 3).unbind(1)
+    occupied[whose, x, y, z] = (~(fine > width / 2 * HALF_DIAGONAL * bound[whose])).to(like.dtype)
+    beside = F.max_pool3d(occupied[:, None], 3, 1, 1)[:, 0] > 0
     return Occupancy(beside, bound, coarse, evaluator.radius, evaluator.evaluations)
 
 
-def _mean_slope(blocks: Float[Tensor, "*batch 2 2 2"], width: float) -> Float[Tensor, "*batch"]:
+def _mean_slope(
+    blocks: Float[Tensor, "*batch 8"], corners: Float[Tensor, "8 3"], width: float
+) -> Float[Tensor, "*batch"]:
     """|∇f| over blocks of cells, by differences averaged over each axis: no more than the steepest slope in them."""
-    means = [blocks.diff(dim=axis).flatten(-3).mean(-1) for axis in (-1, -2, -3)]
-    return torch.stack(means).norm(dim=0) / width
+    return (blocks @ corners).norm(dim=-1) / (4 * width)
 
 
 def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step: float) -> Float[Tensor, "shapes"]:
     """What most |∇f| stay below in the cells nearest to the surface, by differences over a short `step`."""
     shapes = len(values)
-    nearest = values.abs().topk(PROBES, largest=False).indices
-    ahead = centres[nearest][:, :, None] + step * torch.eye(3, dtype=centres.dtype, device=centres.device)
-    whose = torch.arange(shapes, device=centres.device).repeat_interleave(3 * PROBES)
-    moved = evaluator.at(ahead.reshape(-1, 3), whose).reshape(shapes, PROBES, 3)
-    here = evaluator.at(centres[nearest].reshape(-1, 3), whose[::3]).reshape(shapes, PROBES, 1)
-    return ((moved - here) / step).norm(dim=-1).kthvalue(int(STEEP * PROBES), dim=1).values
+    nearest = centres[values.abs().topk(PROBES, largest=False).indices]
+    offsets = step * torch.eye(4, 3, dtype=centres.dtype, device=centres.device)  # the last is none
+    whose = torch.arange(shapes, device=centres.device).repeat_interleave(4 * PROBES)
+    around = evaluator.at((nearest[:, :, None] + offsets).reshape(-1, 3), whose).reshape(shapes, PROBES, 4)
+    return ((around[..., :3] - around[..., 3:]) / step).norm(dim=-1).kthvalue(int(STEEP * PROBES), dim=1).values

@@ -1,6 +1,8 @@
-"""Images as pyramids of square blocks of pixels, each of which a cone around its middle ray stands for."""
+"""The rays of images in the unit sphere: those of all pixels, and the middle rays of square blocks of pixels."""
 
-from dataclasses import replace
+import math
+from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Int
@@ -9,82 +11,105 @@ from torch.nn.functional import normalize
 
 from distrace.camera import Camera
 from distrace.rays import Rays, meet_sphere
-from distrace.tracing.batch import Batch
 
 BRANCH = 3  # blocks split into 3 × 3: the middle part keeps the ray of the whole
+WIDTH = 0.01  # radii: what single rays stand for; they have no pixels
 
 
-class Images:
-    """One image or a batch of them as blocks of pixels, in the unit sphere.
+@dataclass(frozen=True)
+class Lines:
+    """Rays that are traced together. They start where the sphere comes nearest to their camera, in radii."""
 
-    Rays start where the sphere comes nearest to their camera, so that a far camera costs no precision.
-    """
+    table: Float[Tensor, "n 9"]  # origin, direction; where it enters and leaves the sphere (−inf: never), and starts
+    view: Int[Tensor, "n"] | None  # the image of each, and its shape; none where there is but one
 
-    def __init__(self, camera: Camera, radius: float) -> None:
-        intrinsics = camera.intrinsics.reshape(-1, 3, 3)
-        pose = camera.T_world_camera.reshape(-1, 4, 4)
-        inverse = torch.linalg.inv(intrinsics)
-        self.height, self.width, self.views = camera.height, camera.width, len(pose)
-        self.to_world = pose[:, :3, :3] @ inverse
-        self.eye = pose[:, :3, 3] / radius
-        self.shift = (self.eye.norm(dim=1) - 1).clamp_min(0)
-        self.angle = inverse[:, :2, :2].norm(dim=1).amax(1)  # between the rays of neighbouring pixels, at most
-        self.footprint = torch.stack([self.angle * self.shift, self.angle], dim=1)
+    def __len__(self) -> int:
+        return len(self.table)
 
-    def level_of(self, width: float) -> int:
-        """How often the image can be divided by 3 so that blocks, in the middle of the sphere, stay within a width."""
-        pixel = float((self.angle * (self.shift + 1)).max())
-        level = 0
-        while reach(BRANCH ** (level + 1)) * pixel < width and BRANCH**level < max(self.height, self.width):
+    def __getitem__(self, some: Int[Tensor, "m"]) -> "Lines":
+        view = None if self.view is None else self.view.index_select(0, some)
+        return Lines(self.table.index_select(0, some), view)
+
+    @cached_property
+    def parts(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+        """Origins, directions, and the rest."""
+        origins, directions, rest = self.table.split(3, 1)
+        return origins, directions, rest
+
+    def at(self, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n 3"]:
+        return torch.addcmul(self.parts[0], t[..., None], self.parts[1])
+
+    def middle(self) -> Float[Tensor, "n"]:
+        """How far each ray goes to come nearest to the sphere's middle; negative behind its origin."""
+        return -(self.parts[0] * self.parts[1]).sum(1)
+
+    def of_view(self, each: Float[Tensor, "views"]) -> Float[Tensor, "#n"]:
+        """What is known of each view, for each ray."""
+        return each if self.view is None else each.index_select(0, self.view)
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """All rays that may be traced, by number; those of images in a grid that is padded to whole blocks."""
+
+    lines: Lines
+    width: Float[Tensor, "views"]  # of a pixel at the origins …
+    growth: Float[Tensor, "views"]  # … and by how much per unit of distance
+    shape: tuple[int, int, int]  # views, rows, columns; with the padding
+    level: int = 0  # the largest blocks have BRANCH ** level pixels a side
+
+    @staticmethod
+    def of_camera(camera: Camera, radius: float, largest: float) -> "Pixels":
+        """Of an image or a batch of them; in the middle of the sphere the cones of blocks stay within `largest`."""
+        pose = camera.T_world_camera.detach().reshape(-1, 4, 4)
+        inverse = torch.linalg.inv(camera.intrinsics.detach().reshape(-1, 3, 3))
+        eye, rotation = pose[:, :3, 3] / radius, pose[:, :3, :3]
+        shift = (eye.norm(dim=1) - 1).clamp_min(0)
+        growth = inverse[:, :2, :2].norm(dim=1).amax(1)
+        pixel, level = float((growth * (shift + 1)).max()), 0
+        while reach(BRANCH ** (level + 1)) * pixel < largest and BRANCH**level < max(camera.height, camera.width):
             level += 1
-        return level
+        views, side = len(eye), BRANCH**level
+        rows, columns = (-(-size // side) * side for size in (camera.height, camera.width))
+        x, y = (torch.arange(0.5, size, dtype=eye.dtype, device=eye.device) for size in (columns, rows))
+        right, down, ahead = (rotation @ inverse)[:, None, None].unbind(-1)
+        directions = normalize(right * x[:, None] + (down * y[:, None, None] + ahead), dim=-1)
+        origins = torch.addcmul(eye[:, None, None], shift[:, None, None, None], directions)
+        start = shift[:, None, None].expand(views, rows, columns)
+        table = _table(origins, directions, start)
+        table[:, camera.height :, :, 7] = table[:, :, camera.width :, 7] = -torch.inf  # the padding sees nothing
+        view = None if views == 1 else torch.arange(views, device=eye.device).repeat_interleave(rows * columns)
+        return Pixels(Lines(table.reshape(-1, 9), view), growth * shift, growth, (views, rows, columns), level)
 
-    def blocks(self, stride: int) -> Batch:
-        """All blocks of `stride` pixels a side."""
-        counts = (self.views, -(-self.height // stride), -(-self.width // stride))
-        index = [torch.arange(count, device=self.eye.device) for count in counts]
-        view, row, column = torch.cartesian_prod(*index).unbind(1)
-        return self._batch(view, row, column, stride)
+    @staticmethod
+    def of_rays(rays: Rays) -> "Pixels":
+        """Rays that are no image, from where they enter a sphere of twice the radius."""
+        start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
+        lines = Lines(_table(rays.at(start), rays.directions, start), None)
+        zero = start.new_zeros(1)
+        return Pixels(lines, zero + WIDTH, zero, (1, 1, len(start)))
 
-    def beside(self) -> Float[Tensor, "pixels"]:
-        """How far the ray of each pixel goes to pass the middle of the sphere; infinite where it misses the sphere."""
-        pixels = self.blocks(1)
-        return beside_middle(Rays(pixels.origins, pixels.directions))
+    def blocks(self) -> Int[Tensor, "n"]:
+        """The middle rays of all of the largest blocks."""
+        views, rows, columns = self.shape
+        side, device = BRANCH**self.level, self.width.device
+        row, column = (torch.arange(side // 2, size, side, device=device) for size in (views * rows, columns))
+        return (row[:, None] * columns + column).reshape(-1)
 
-    def split(self, batch: Batch, stride: int) -> tuple[Batch, Int[Tensor, "m"]]:
-        """The nine parts of each block, where they show something of the image, and the block of each.
-
-        `stride` is that of the parts, in pixels.
-        """
-        parts = torch.arange(BRANCH, device=self.eye.device)
-        row = (batch.row[:, None, None] * BRANCH + parts[:, None]).expand(-1, BRANCH, BRANCH).reshape(-1)
-        column = (batch.column[:, None, None] * BRANCH + parts).expand(-1, BRANCH, BRANCH).reshape(-1)
-        inside = ((row * stride < self.height) & (column * stride < self.width)).nonzero()[:, 0]
-        parent = inside // BRANCH**2
-        new = self._batch(batch.view[parent], row[inside], column[inside], stride)
-        return replace(new, t=batch.t[parent], far=batch.far[parent]), parent
-
-    def _batch(self, view: Tensor, row: Tensor, column: Tensor, stride: int) -> Batch:
-        """Rays through the middles of blocks."""
-        like = self.eye
-        pixels = torch.stack([column, row, torch.ones_like(row)], dim=1).to(like.dtype)
-        middles = pixels * like.new_tensor([stride, stride, 1.0]) + like.new_tensor([stride / 2, stride / 2, 0.0])
-        if self.views == 1:
-            directions = normalize(middles @ self.to_world[0].T, dim=1)
-        else:
-            directions = normalize((self.to_world[view] @ middles[:, :, None])[:, :, 0], dim=1)
-        origins = torch.addcmul(self.eye[view], self.shift[view][:, None], directions)
-        nothing = torch.zeros_like(origins[:, 0])
-        return Batch(view, row, column, origins, directions, self.footprint[view], nothing, nothing)
+    def split(self, blocks: Int[Tensor, "n"], side: int) -> Int[Tensor, "m"]:
+        """The middle rays of the nine parts of each block, nine after nine; `side` is that of the parts, in pixels."""
+        offset = torch.arange(-side, side + 1, side, device=blocks.device)
+        around = (offset[:, None] * self.shape[2] + offset).reshape(-1)
+        return (blocks[:, None] + around).reshape(-1)
 
 
-def reach(stride: int) -> float:
+def _table(
+    origins: Float[Tensor, "*n 3"], directions: Float[Tensor, "*n 3"], start: Float[Tensor, "*n"]
+) -> Float[Tensor, "*n 9"]:
+    bounds = meet_sphere(Rays(origins, directions))
+    return torch.cat([origins, directions, torch.stack([bounds.near, bounds.far, start], dim=-1)], dim=-1)
+
+
+def reach(side: int) -> float:
     """From the middle of a block to the middle of its farthest pixel, in pixels."""
-    return (stride - 1) / 2**0.5
-
-
-def beside_middle(rays: Rays) -> Float[Tensor, "*batch"]:
-    """How far each ray goes to pass the middle of the unit sphere; infinite where it misses the sphere."""
-    bounds = meet_sphere(rays)
-    nearest = -(rays.origins * rays.directions).sum(-1)
-    return torch.where(bounds.meets, nearest.clamp(bounds.near, bounds.far), torch.inf)
+    return (side - 1) / math.sqrt(2)

@@ -1,125 +1,140 @@
-"""Marching without gradients: cones of blocks, then single rays up to their first root."""
+"""Marching without gradients: cones of blocks of pixels, then single rays in lock step up to their first root."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from distrace.tracing.batch import Batch
-from distrace.tracing.evaluator import Evaluator, Values
+from distrace.tracing.images import Lines
 
-STUCK = 0.5  # of a cone's radius: a shorter step moves it no more
-FLAT = 0.15  # slope along a ray, at most, from which a root is predicted: flatter rays graze the surface
-AHEAD = 5e-4  # radii before a predicted root, at most, that may stay unchecked
-GAP = 2e-3  # radii, at most, by which a step is longer than f, where the slope says that the ray stays outside …
-GAP_MOST = 1e-2  # … twice as much with every step after which the slope is what it was, to BEND; up to this
-BEND = 0.1
-LEVEL = 0.05  # slope below which a ray counts as parallel to the surface
+Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
+UNKNOWN = 1e3  # radii: the value at a start that was not looked at
+FLATTEST = 1e-3  # slope of f along a ray: the least by which its root is extrapolated
+SURE = 4.0  # tolerances: from the ball around a sample outside to one inside, where the line's root is taken
+EARLY = 0.2  # of the error of rough values: so far outside the surface the first exact look aims
+PATIENCE = 16  # looks after which few rays may be looked at in as many places as there are rays
+MOST = 256  # places along a ray in one look
 
 
-@dataclass(frozen=True)
-class Roots:
-    """Where rays are predicted to meet the surface first."""
+class State(NamedTuple):
+    """What is known of rays, in radii. Each is clear up to `t`, but for gaps."""
 
-    ray: Int[Tensor, "n"]  # its number in the batch
     t: Float[Tensor, "n"]
-    slope: Float[Tensor, "n"]  # of f along the ray
-    low: Float[Tensor, "n"]  # the last point outside
-    high: Float[Tensor, "n"]  # the first inside; infinite while there is none
+    value: Float[Tensor, "n"]  # of f at t
+    at: Float[Tensor, "n"]  # where f is looked at next
+    high: Float[Tensor, "n"]  # the nearest point inside; infinite while there is none
+    far: Float[Tensor, "n"]  # beyond there is no surface
+    least: Float[Tensor, "n"]  # f so far …
+    closest: Float[Tensor, "n"]  # … and where that was
+    hit: Float[Tensor, "n"]  # NaN until there is one
+    looks: Float[Tensor, "n"]  # evaluations of f
+
+    @staticmethod
+    def of_spans(t: Float[Tensor, "n"], far: Float[Tensor, "n"]) -> "State":
+        """Of rays that are clear before t."""
+        never, zero = torch.full_like(t, torch.inf), torch.zeros_like(t)
+        return State(t, zero + UNKNOWN, t, never, far, never, t, never * 0, zero)
 
 
-@dataclass(frozen=True)
-class Marched:
-    """What a march found; rays in neither list left the bounds."""
-
-    roots: Roots
-    stopped: Int[Tensor, "n"]  # rays that were still on their way, or in doubt …
-    clear: Float[Tensor, "n"]  # … and how far they came
-    inside: Int[Tensor, "begun"]  # rays that began inside
-    closest: Float[Tensor, "rays"]  # where f was least, of all rays
-    evaluations: Int[Tensor, "rays"]
-
-
-def march_cones(evaluator: Evaluator, batch: Batch, reach: float, steps: int) -> Batch:
+def march_cones(
+    values: Values,
+    lines: Lines,
+    span: Float[Tensor, "2 n"],
+    width: Float[Tensor, "#n"],
+    growth: Float[Tensor, "#n"],
+    looks: int,
+) -> Float[Tensor, "2 n"]:
     """Moves each block's cone on while the ball around its middle ray that f keeps clear covers the cone.
 
-    `reach` is the cone's radius in pixels. A ball of radius r at t covers the cone up to t + √(r² − ρ²), where ρ is the
-    cone's radius at t + r at the farthest. Cones that leave the bounds are dropped.
+    `span` tells from where and up to where a cone may see surface; its radius is width + growth · t. A ball of radius r
+    at t covers the cone up to t + √(r² − ρ²), where ρ is the cone's radius at t + r at the farthest.
     """
-    t = batch.t.clone()
-    active = torch.arange(len(t), device=t.device)
-    some = batch
-    for _ in range(steps):
-        at = t[active]
-        clear = evaluator.rough(some, at)
-        radius = reach * some.pixel(at + clear)
-        step = torch.where(clear > radius, (clear * clear - radius * radius).sqrt(), 0.0)
-        t[active] = at + step
-        go = ((step > STUCK * radius) & (at + step < some.far)).nonzero()[:, 0]
-        active, some = active[go], some[go]
-    return batch.from_(t)[(t < batch.far).nonzero()[:, 0]]
+    t, far = span.unbind(0)
+    for _ in range(looks):
+        clear = values(lines, t).clamp_min(0)
+        radius = torch.addcmul(width, growth, t + clear)
+        t = t + torch.addcmul(clear * clear, radius, radius, value=-1).clamp_min(0).sqrt()
+    return torch.stack([t, far])
 
 
-def march_rays(
-    evaluate: Values, batch: Batch, steps: tuple[int, ...], *, error: float = 0.0, predict: bool = True
-) -> Marched:
-    """Sphere tracing of single rays until a root is predicted or bracketed.
+def march(
+    values: Values,
+    lines: Lines,
+    states: Float[Tensor, "9 n"],
+    active: Int[Tensor, "m"],
+    looks: int,
+    gap: Float[Tensor, "views"],
+    tolerance: Float[Tensor, "views"],
+    error: float | None = None,
+) -> Int[Tensor, "left"]:
+    """Looks at the active rays in lock step; writes what became of them to `states`, returns those without a result.
 
-    A step is as long as f, and by up to a gap longer where the slope along the ray says that it stays outside.
-    `steps` tells how many steps are evaluated at once, each time; they count as far as f bears them out. Values are
-    good to `error`: a ray that comes closer to the surface without a slope stops in doubt. Without `predict` only a
-    change of sign is a root.
+    A step ends at the root of the line through the last two values, or where the balls around its ends, by the slope,
+    leave half a gap between them; it counts if they leave no more than the gap. In a bracket it is no longer than half.
+    A ray is hit where f, outside, is too small for the line's root to be none, or where a ball and a sample inside
+    leave little between them. When few rays are left each is looked at in several places at once. Values that are good
+    to an `error` never decide on a hit: rays where f is no greater are left alone.
     """
-    t = batch.t
-    active = torch.arange(len(t), device=t.device)
-    value = evaluate(batch, t)
-    doubtful = ~(value > error)
-    inside = (value <= -error).nonzero()[:, 0]
-    least, closest = value.clone(), t.clone()
-    evaluations = torch.ones_like(active)
-    stopped, clear = [active[doubtful]], [t[doubtful]]
-    rays, found = [], []
-    state = torch.stack([t, value, torch.ones_like(t), torch.full_like(t, GAP)], dim=1)
-    some, go = batch, (~doubtful).nonzero()[:, 0]
-    for number, count in enumerate(steps):
-        if not len(go):
+    zero = error or 0.0
+    order = torch.arange(MOST + 1, dtype=states.dtype, device=states.device)[:, None]
+    for number in range(looks):
+        if not len(active):
             break
-        some, active = some[go], active[go]
-        t, value, last_slope, gap = state[go].unbind(1)
-        longest = value / (0.9 * last_slope.abs().clamp_min(LEVEL))
-        length = torch.minimum(value + gap, longest.maximum(value)).maximum(0.1 * gap)
-        order = torch.arange(count + 1, device=t.device, dtype=t.dtype)[:, None]
-        times = t + order * length
-        ahead = evaluate(some, times[1:])
-        values = torch.cat([value[None], ahead])
-        allowed = length <= values[:-1] + 1.5 * gap
-        last = ((ahead > error) & allowed).long().cumprod(0).sum(0).clamp_max(count - 1)[None]
-        value, ahead, allowed = (rows.gather(0, last)[0] for rows in (values, ahead, allowed))
-        t, following = (times.gather(0, at)[0] for at in (last, last + 1))
-        slope = (ahead - value) / (following - t)
-        root = following - ahead / slope
-        crossed = allowed & (ahead <= -error)
-        near = allowed & predict & (slope < -FLAT) & (root - following < ahead + AHEAD)
-        unsure = allowed & ~(crossed | near) & ~(ahead.abs() > error)
-        t_next = torch.where(allowed, following, t)
-        going = ~(crossed | near | unsure) & (t_next < some.far)
-        low = torch.where(allowed & (ahead > error), following, t)
-        high = torch.where(crossed, following, torch.inf)
-        ends = (crossed | near).nonzero()[:, 0]
-        rays.append(active[ends])
-        found.append(torch.stack([root, slope, low, high], dim=1)[ends])
-        if number == len(steps) - 1:
-            unsure = unsure | going
-        stopped.append(active[unsure])
-        clear.append(low[unsure])
-        nearer = ahead.abs() < least[active]
-        least[active] = torch.where(nearer, ahead.abs(), least[active])
-        closest[active] = torch.where(nearer, following, closest[active])
-        evaluations[active] += count
-        gap = torch.where((slope - last_slope).abs() < BEND, (2 * gap).clamp_max(GAP_MOST), GAP)
-        state = torch.stack([t_next, torch.where(allowed, ahead, value), slope, gap], dim=1)
-        go = going.nonzero()[:, 0]
-    parts = torch.cat(found).unbind(1) if found else [t[:0]] * 4
-    roots = Roots(torch.cat(rays) if rays else active[:0], *parts)
-    return Marched(roots, torch.cat(stopped), torch.cat(clear), inside, closest, evaluations)
+        some = lines[active]
+        state = State(*states.index_select(1, active).unbind(0))
+        allowed = some.of_view(gap)
+        probes = max(1, min(MOST, states.shape[1] * number // (PATIENCE * len(active))))
+        t, before, after, at = _looked(values, some, state, order[: probes + 1], allowed, zero)
+        step = at - t
+        covered = before + after + allowed >= step
+        clear = covered & (after > zero)
+        crossed = after <= -zero
+        known = covered | crossed
+        moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
+        slope = (after - before) / step
+        falling = slope.clamp(-1, -FLATTEST)
+        root = torch.addcdiv(at, after - EARLY * zero if zero else after, falling, value=-1)
+        balls = torch.addcdiv(at, torch.add(allowed / 2, after, alpha=2), 1 - falling)
+        onward = torch.minimum(torch.minimum(root, balls), (moved + state.high) / 2)
+        following = torch.where(known, onward, moved + value + allowed)
+        high = torch.where(crossed, at, state.high)
+        going, hit = moved < state.far, state.hit
+        if error is None:
+            close = some.of_view(tolerance)
+            found = (value < close * falling * falling) & (slope > -2)  # not where nothing was known before
+            found = found | (crossed & (step - before < SURE * close))
+            hit = torch.where(found, torch.minimum(root, high), hit)
+            going = going > found
+        else:
+            going = going & (clear | ~known)
+        closest, least = torch.where(after < state.least, at, state.closest), torch.minimum(after, state.least)
+        new = State(moved, value, following, high, state.far, least, closest, hit, state.looks + probes)
+        states.index_copy_(1, active, torch.stack(new))
+        active = active.index_select(0, going.nonzero()[:, 0])
+    return active
+
+
+def _looked(
+    values: Values, lines: Lines, state: State, order: Float[Tensor, "k 1"], gap: Float[Tensor, "#n"], zero: float
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Two neighbouring samples of each ray, t, f(t), f(t') and t': the first pair of those that may not be passed.
+
+    `order` counts the samples from 0, which is that at the state's t.
+    """
+    probes = len(order) - 1
+    if probes == 1:
+        return state.t, state.value, values(lines, state.at), state.at
+    step = torch.minimum(state.at - state.t, (state.high - state.t) / (probes + 1))
+    along = torch.addcmul(state.t, order, step)
+    ahead = torch.cat([state.value[None], values(lines, along[1:])])
+    before, after = ahead[:-1], ahead[1:]
+    outside = after > zero
+    passes = outside & (before + after + gap >= step)
+    passes[:-1] &= (2 * after > before)[:-1] | ~outside[1:]  # but not where the line's root lies before the next sample
+    first = passes.long().cumprod(0).sum(0, keepdim=True).clamp_max(probes - 1)
+    pair = torch.cat([first, first + 1])
+    t, at = along.gather(0, pair).unbind(0)
+    before, after = ahead.gather(0, pair).unbind(0)
+    return t, before, after, at
