@@ -277,3 +277,19 @@ def test_sizes_that_no_image_has_are_refused() -> None:
 def test_a_view_of_nothing_has_a_picture_too() -> None:
     nothing = measure_view(View("nothing", None, sphere(0.5, torch.tensor([0.0, 9, 0])), SHOT), "cautious", CAUTIOUS)
     assert all((picture == 255).all() and picture.shape == (256, 256, 3) for picture in pictures_of(nothing))
+
+
+def test_a_reference_is_kept_and_read_again(tmp_path) -> None:
+    first = measure_view(BALL, "cautious", CAUTIOUS, tmp_path)
+    (path,) = tmp_path.iterdir()
+    with np.load(path) as content:
+        assert content["depth"].shape == first.truth.shape
+    np.savez(path, depth=first.truth.numpy() + 1, seconds=np.float32(7))
+    again = measure_view(BALL, "cautious", CAUTIOUS, tmp_path)
+    assert again.row.reference_seconds == 7
+    torch.testing.assert_close(again.truth, first.truth + 1)
+    other = replace(BALL, sdf=sphere(0.4))
+    assert measure_view(other, "cautious", CAUTIOUS, tmp_path).row.pixels < first.row.pixels
+    path.write_bytes(b"no archive")
+    with pytest.raises(ValueError, match="holds no reference"):
+        measure_view(BALL, "cautious", CAUTIOUS, tmp_path)

@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.decoder import Decoder
-from distrace.products import Layer
+from distrace.products import LINEAR_RELU, Layer
 from distrace.rounded import ROWS, Rounded, filled
 
 PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
@@ -123,5 +123,5 @@ def _placed(
     weight, bias = layer
     if shape is not None:
         bias = bias.index_select(0, shape)
-    product = torch._addmm_activation if then == "relu" else torch.addmm
+    product = LINEAR_RELU if then == "relu" else torch.addmm
     return product(bias, points, weight).bfloat16()

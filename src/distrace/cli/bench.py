@@ -51,12 +51,14 @@ class Bench:
     fields: Flag = False  # of `views`: analytic fields, too; without MODEL, these alone
     strategy: str | None = None  # of `views`: as in `distrace render`; by default what `distrace.render` does unasked
     seed: int = 0  # of `views`
+    references: Path | None = None  # of `views`: a folder to keep references in, which take most of the time
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         if self.what == "views":
-            bench_views(run, Plan(self.models, self.fields, self.views, self.sizes, self.seed, self.strategy))
+            drawn = self.models, self.fields, self.views, self.sizes, self.seed, self.strategy
+            bench_views(run, Plan(*drawn, kept=self.references))
         else:
             getattr(self, f"_{self.what}")(run, opened(self.model, run.device))
 

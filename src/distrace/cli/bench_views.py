@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from pathlib import Path
 
 from distrace.checkpoint import Model, bundled_models, load_model
 from distrace.cli.common import opened, show_table
@@ -29,6 +30,7 @@ class Plan:
     sizes: tuple[int, int]
     seed: int
     strategy: str | None  # None: as `render` does by default
+    kept: Path | None = None  # a folder of references
 
     def __post_init__(self) -> None:
         if self.views < 1:
@@ -70,7 +72,7 @@ def bench_views(run: Run, plan: Plan) -> None:
     rows, worst = [], list[Measured]()
     with progress("views", plan.count()) as bar:
         for view in plan.drawn(models):
-            measured = measure_view(view, strategy, config)
+            measured = measure_view(view, strategy, config, plan.kept)
             rows.append(measured.row)
             worst = sorted([*worst, measured], key=badness, reverse=True)[:SHOWN]  # images of others are let go
             took = measured.row.seconds + measured.row.reference_seconds
