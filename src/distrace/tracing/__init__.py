@@ -1,1 +1,1 @@
-"""The default tracer. Read in the order in which a ray lives: bounds, blocks, cones, march, roots, tracer."""
+"""The default tracer. Read in the order in which a ray lives: bounds, images, evaluator, march, tracer."""

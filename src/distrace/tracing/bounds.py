@@ -14,7 +14,7 @@ from distrace.tracing.images import Lines
 CELLS = 16  # along the diameter of the unit sphere; those that may hold surface are split once
 HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
 MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies between the samples
-SAMPLES = 64  # of the cells along a ray through the sphere: less than half a cell apart
+SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: less than half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
 STEEP = 0.9  # share of these gradients that the bound covers: ReLU networks have a few steep facets
 

@@ -13,7 +13,6 @@ from distrace.camera import Camera
 from distrace.rays import Rays, meet_sphere
 
 BRANCH = 3  # blocks split into 3 × 3: the middle part keeps the ray of the whole
-WIDTH = 0.01  # radii: what single rays stand for; they have no pixels
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ class Pixels:
         start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
         lines = Lines(_table(rays.at(start), rays.directions, start), None)
         zero = start.new_zeros(1)
-        return Pixels(lines, zero + WIDTH, zero, (1, 1, len(start)))
+        return Pixels(lines, zero + torch.inf, zero, (1, 1, len(start)))
 
     def blocks(self) -> Int[Tensor, "n"]:
         """The middle rays of all of the largest blocks."""

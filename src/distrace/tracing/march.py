@@ -1,5 +1,6 @@
 """Marching without gradients: cones of blocks of pixels, then single rays in lock step up to their first root."""
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -11,11 +12,8 @@ from distrace.tracing.images import Lines
 
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 UNKNOWN = 1e3  # radii: the value at a start that was not looked at
-FLATTEST = 1e-3  # slope of f along a ray: the least by which its root is extrapolated
 SURE = 4.0  # tolerances: from the ball around a sample outside to one inside, where the line's root is taken
-EARLY = 0.2  # of the error of rough values: so far outside the surface the first exact look aims
-PATIENCE = 16  # looks after which few rays may be looked at in as many places as there are rays
-MOST = 256  # places along a ray in one look
+PATIENCE = 4  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
 
 
 class State(NamedTuple):
@@ -77,16 +75,15 @@ def march(
     leave little between them. When few rays are left each is looked at in several places at once. Values that are good
     to an `error` never decide on a hit: rays where f is no greater are left alone.
     """
-    zero = error or 0.0
-    order = torch.arange(MOST + 1, dtype=states.dtype, device=states.device)[:, None]
+    zero, half, sure = error or 0.0, gap / 2, SURE * tolerance
     for number in range(looks):
         if not len(active):
             break
         some = lines[active]
         state = State(*states.index_select(1, active).unbind(0))
         allowed = some.of_view(gap)
-        probes = max(1, min(MOST, states.shape[1] * number // (PATIENCE * len(active))))
-        t, before, after, at = _looked(values, some, state, order[: probes + 1], allowed, zero)
+        probes = max(1, math.isqrt(states.shape[1] * number // (PATIENCE * len(active))))
+        t, before, after, at = _looked(values, some, state, probes, allowed, zero)
         step = at - t
         covered = before + after + allowed >= step
         clear = covered & (after > zero)
@@ -94,9 +91,9 @@ def march(
         known = covered | crossed
         moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
         slope = (after - before) / step
-        falling = slope.clamp(-1, -FLATTEST)
-        root = torch.addcdiv(at, after - EARLY * zero if zero else after, falling, value=-1)
-        balls = torch.addcdiv(at, torch.add(allowed / 2, after, alpha=2), 1 - falling)
+        falling = slope.clamp(-1, -1e-6)
+        root = torch.addcdiv(at, after, falling, value=-1)
+        balls = torch.addcdiv(at, torch.add(some.of_view(half), after, alpha=2), 1 - falling)
         onward = torch.minimum(torch.minimum(root, balls), (moved + state.high) / 2)
         following = torch.where(known, onward, moved + value + allowed)
         high = torch.where(crossed, at, state.high)
@@ -104,7 +101,7 @@ def march(
         if error is None:
             close = some.of_view(tolerance)
             found = (value < close * falling * falling) & (slope > -2)  # not where nothing was known before
-            found = found | (crossed & (step - before < SURE * close))
+            found = found | (crossed & (step - before < some.of_view(sure)))
             hit = torch.where(found, torch.minimum(root, high), hit)
             going = going > found
         else:
@@ -117,22 +114,19 @@ def march(
 
 
 def _looked(
-    values: Values, lines: Lines, state: State, order: Float[Tensor, "k 1"], gap: Float[Tensor, "#n"], zero: float
+    values: Values, lines: Lines, state: State, probes: int, gap: Float[Tensor, "#n"], zero: float
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Two neighbouring samples of each ray, t, f(t), f(t') and t': the first pair of those that may not be passed.
-
-    `order` counts the samples from 0, which is that at the state's t.
-    """
-    probes = len(order) - 1
+    """Two neighbouring samples of each ray, t, f(t), f(t') and t': the first pair of those that may not be passed."""
     if probes == 1:
         return state.t, state.value, values(lines, state.at), state.at
     step = torch.minimum(state.at - state.t, (state.high - state.t) / (probes + 1))
+    order = torch.arange(probes + 1, dtype=step.dtype, device=step.device)[:, None]
     along = torch.addcmul(state.t, order, step)
     ahead = torch.cat([state.value[None], values(lines, along[1:])])
     before, after = ahead[:-1], ahead[1:]
     outside = after > zero
     passes = outside & (before + after + gap >= step)
-    passes[:-1] &= (2 * after > before)[:-1] | ~outside[1:]  # but not where the line's root lies before the next sample
+    passes[:-1].logical_and_((2 * after > before)[:-1] | ~outside[1:])  # not where the line has a root before the next
     first = passes.long().cumprod(0).sum(0, keepdim=True).clamp_max(probes - 1)
     pair = torch.cat([first, first + 1])
     t, at = along.gather(0, pair).unbind(0)

@@ -1,4 +1,4 @@
-"""The default tracer: cells that may hold surface, cones of blocks of pixels, predicted roots, single rays."""
+"""The default tracer: cells that may hold surface, cones of blocks of pixels, single rays."""
 
 import math
 from dataclasses import dataclass
@@ -17,9 +17,8 @@ from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import State, march, march_cones
 
-LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; half a cell of the occupancy
-CONE_LOOKS = 5  # at the cones of each level
-ROUGH_LOOKS = 4  # looks by rough values …
+LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
+ROUGH_LOOKS = 4  # looks by rough values, at the cones of each level and at single rays …
 LOOKS = 48  # … and by exact ones: rays that graze the surface take many
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
 FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
@@ -93,7 +92,7 @@ def _traced(
         number, span = _within(number, span)
         lines, cone = pixels.lines[number], reach(BRANCH**level)
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
-        span = march_cones(evaluator.rough, lines, span, width, growth, CONE_LOOKS)
+        span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
     setup = evaluator.evaluations
     near, far, _ = pixels.lines[number].parts[2].unbind(1)
