@@ -13,7 +13,7 @@ from distrace.tracing.images import Lines
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 UNKNOWN = 1e3  # radii: the value at a start that was not looked at
 SURE = 4.0  # tolerances: from the ball around a sample outside to one inside, where the line's root is taken
-PATIENCE = 4  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
+PATIENCE = 8  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
 
 
 class State(NamedTuple):
@@ -69,11 +69,12 @@ def march(
 ) -> Int[Tensor, "left"]:
     """Looks at the active rays in lock step; writes what became of them to `states`, returns those without a result.
 
-    A step ends at the root of the line through the last two values, or where the balls around its ends, by the slope,
-    leave half a gap between them; it counts if they leave no more than the gap. In a bracket it is no longer than half.
-    A ray is hit where f, outside, is too small for the line's root to be none, or where a ball and a sample inside
-    leave little between them. When few rays are left each is looked at in several places at once. Values that are good
-    to an `error` never decide on a hit: rays where f is no greater are left alone.
+    A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
+    where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
+    the gap. In a bracket it is no longer than half. A ray is hit where f, outside, is too small for the line's root to
+    be none, or where a ball and a sample inside leave little between them. When few rays are left each is looked at in
+    several places at once. Values that are good to an `error` never decide on a hit: rays where f is no greater are
+    left alone.
     """
     zero, half, sure = error or 0.0, gap / 2, SURE * tolerance
     for number in range(looks):
@@ -92,15 +93,16 @@ def march(
         moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
         slope = (after - before) / step
         falling = slope.clamp(-1, -1e-6)
+        level = some.of_view(tolerance) * falling * falling
         root = torch.addcdiv(at, after, falling, value=-1)
+        aim = torch.addcdiv(at, torch.sub(after, level, alpha=0.5), falling, value=-1)
         balls = torch.addcdiv(at, torch.add(some.of_view(half), after, alpha=2), 1 - falling)
-        onward = torch.minimum(torch.minimum(root, balls), (moved + state.high) / 2)
+        onward = torch.minimum(torch.minimum(aim, balls), (moved + state.high) / 2)
         following = torch.where(known, onward, moved + value + allowed)
         high = torch.where(crossed, at, state.high)
         going, hit = moved < state.far, state.hit
         if error is None:
-            close = some.of_view(tolerance)
-            found = (value < close * falling * falling) & (slope > -2)  # not where nothing was known before
+            found = (value < level) & (slope > -2)  # not where nothing was known before
             found = found | (crossed & (step - before < some.of_view(sure)))
             hit = torch.where(found, torch.minimum(root, high), hit)
             going = going > found

@@ -18,7 +18,7 @@ from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import State, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
-ROUGH_LOOKS = 4  # looks by rough values, at the cones of each level and at single rays …
+ROUGH_LOOKS = 5  # looks by rough values, at the cones of each level and at single rays …
 LOOKS = 48  # … and by exact ones: rays that graze the surface take many
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
 FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
