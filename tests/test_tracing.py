@@ -254,7 +254,7 @@ def test_a_batch_of_shapes_and_cameras_is_what_single_calls_give() -> None:
             alone = render(model.field(codes[k]), camera)
             assert alone.mask.sum() > 20
             assert (together.trace.outcome[k] == alone.trace.outcome).all()
-            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=1e-4)
+            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=2.5e-4)
 
 
 def test_the_gradients_of_a_batch_are_those_of_single_calls() -> None:

@@ -16,7 +16,7 @@ HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
 MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies between the samples
 SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: less than half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
-STEEP = 0.9  # share of these gradients that the bound covers: ReLU networks have a few steep facets
+STEEP = 0.97  # share of these gradients that the bound covers: ReLU networks have a few steep facets
 
 
 @dataclass(frozen=True)
@@ -29,9 +29,10 @@ class Occupancy:
     radius: float
     evaluations: int
 
-    def entered(self, lines: Lines) -> Float[Tensor, "2 n"]:
-        """From the first to the last cell on the way of each ray that may hold surface; from inf to −inf if none does.
+    def entered(self, lines: Lines) -> Float[Tensor, "3 n"]:
+        """From the first to the last cell on the way of each ray that may hold surface, and from the first again.
 
+        From inf to −inf if none does.
         Cells are looked at by samples along the ray.
         """
         cells = self.occupied.shape[-1]
@@ -48,7 +49,7 @@ class Occupancy:
         held = self.occupied.reshape(-1)[place]
         first = torch.where(held, order, torch.inf).amin(0)
         last = torch.where(held, order + 1, -torch.inf).amax(0)
-        return torch.addcmul(near, torch.stack([first, last]), apart)
+        return torch.addcmul(near, torch.stack([first, last, first]), apart)
 
     @torch.no_grad()
     def lowest(self, rays: Rays, bounds: Bounds, shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:

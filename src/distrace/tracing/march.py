@@ -12,7 +12,7 @@ from distrace.tracing.images import Lines
 
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 UNKNOWN = 1e3  # radii: the value at a start that was not looked at
-SURE = 4.0  # tolerances: from the ball around a sample outside to one inside, where the line's root is taken
+BRACKET = 8.0  # tolerances: in a shorter one the root of the line is taken
 PATIENCE = 8  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
 
 
@@ -39,22 +39,24 @@ class State(NamedTuple):
 def march_cones(
     values: Values,
     lines: Lines,
-    span: Float[Tensor, "2 n"],
+    span: Float[Tensor, "3 n"],
     width: Float[Tensor, "#n"],
     growth: Float[Tensor, "#n"],
     looks: int,
-) -> Float[Tensor, "2 n"]:
+    error: float,
+) -> Float[Tensor, "3 n"]:
     """Moves each block's cone on while the ball around its middle ray that f keeps clear covers the cone.
 
-    `span` tells from where and up to where a cone may see surface; its radius is width + growth · t. A ball of radius r
-    at t covers the cone up to t + √(r² − ρ²), where ρ is the cone's radius at t + r at the farthest.
+    `span` tells from where and up to where a cone may see surface, and where it began; its radius is width + growth · t.
+    A ball of radius r at t covers the cone up to t + √(r² − ρ²), where ρ is the cone's radius at t + r at the farthest.
+    Values are good to an `error`, which is taken off.
     """
-    t, far = span.unbind(0)
+    t, far, begin = span.unbind(0)
     for _ in range(looks):
-        clear = values(lines, t).clamp_min(0)
+        clear = (values(lines, t) - error).clamp_min(0)
         radius = torch.addcmul(width, growth, t + clear)
         t = t + torch.addcmul(clear * clear, radius, radius, value=-1).clamp_min(0).sqrt()
-    return torch.stack([t, far])
+    return torch.stack([t, far, begin])
 
 
 def march(
@@ -72,11 +74,10 @@ def march(
     A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
     where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
     the gap. In a bracket it is no longer than half. A ray is hit where f, outside, is too small for the line's root to
-    be none, or where a ball and a sample inside leave little between them. When few rays are left each is looked at in
-    several places at once. Values that are good to an `error` never decide on a hit: rays where f is no greater are
-    left alone.
+    be none, or in a short bracket. When few rays are left each is looked at in several places at once. Values that are
+    good to an `error` never decide on a hit: rays where f is no greater are left alone.
     """
-    zero, half, sure = error or 0.0, gap / 2, SURE * tolerance
+    zero, half, short = error or 0.0, gap / 2, BRACKET * tolerance
     for number in range(looks):
         if not len(active):
             break
@@ -91,8 +92,7 @@ def march(
         crossed = after <= -zero
         known = covered | crossed
         moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
-        slope = (after - before) / step
-        falling = slope.clamp(-1, -1e-6)
+        falling = ((after - before) / step).clamp(-1, -1e-6)
         level = some.of_view(tolerance) * falling * falling
         root = torch.addcdiv(at, after, falling, value=-1)
         aim = torch.addcdiv(at, torch.sub(after, level, alpha=0.5), falling, value=-1)
@@ -102,10 +102,10 @@ def march(
         high = torch.where(crossed, at, state.high)
         going, hit = moved < state.far, state.hit
         if error is None:
-            found = (value < level) & (slope > -2)  # not where nothing was known before
-            found = found | (crossed & (step - before < some.of_view(sure)))
+            seen = before < UNKNOWN
+            found = ((value < level) | (crossed & (step < some.of_view(short)))) & seen
             hit = torch.where(found, torch.minimum(root, high), hit)
-            going = going > found
+            going = (going > found) & (clear | seen)
         else:
             going = going & (clear | ~known)
         closest, least = torch.where(after < state.least, at, state.closest), torch.minimum(after, state.least)

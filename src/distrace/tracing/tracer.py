@@ -15,7 +15,7 @@ from distrace.trace import Outcome, Trace
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import BRANCH, Pixels, reach
-from distrace.tracing.march import State, march, march_cones
+from distrace.tracing.march import UNKNOWN, State, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
 ROUGH_LOOKS = 5  # looks by rough values, at the cones of each level and at single rays …
@@ -92,13 +92,14 @@ def _traced(
         number, span = _within(number, span)
         lines, cone = pixels.lines[number], reach(BRANCH**level)
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
-        span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS)
+        span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS, evaluator.error)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
     setup = evaluator.evaluations
     near, far, _ = pixels.lines[number].parts[2].unbind(1)
-    number, span = _within(number, torch.stack([span[0].maximum(near), span[1].minimum(far)]))
-    lines = pixels.lines[number]
-    states = torch.stack(State.of_spans(*span.unbind(0)))
+    begin = span[2].maximum(near)
+    number, span = _within(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
+    lines, begin = pixels.lines[number], span[2]
+    states = torch.stack(State.of_spans(span[0], span[1]))
     left = torch.arange(len(number), device=number.device)
     pixel = pixels.width + pixels.growth  # in the middle of the sphere
     limits = (2 * pixel).clamp_max(GAP), (FINE * pixel).clamp_max(config.tolerance)
@@ -106,10 +107,15 @@ def _traced(
         march(evaluator.rough, lines, states, left, ROUGH_LOOKS, *limits, evaluator.error)
         left = (states[0] < states[4]).nonzero()[:, 0]
     left = march(evaluator.exact, lines, states, left, LOOKS, *limits)
+    within = ((states[1] >= UNKNOWN) & (begin < states[0])).nonzero()[:, 0]
+    if len(within):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
+        again = State.of_spans(begin[within], span[1, within])
+        states[:, within] = torch.stack(again._replace(looks=states[8, within]))
+        left = torch.cat([left, march(evaluator.exact, lines, states, within, LOOKS, *limits)])
     return _result(pixels, number, State(*states.unbind(0)), left, radius, setup), occupancy
 
 
-def _within(number: Int[Tensor, "n"], span: Float[Tensor, "2 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "2 m"]]:
+def _within(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Without the rays of which nothing is left."""
     some = (span[0] < span[1]).nonzero()[:, 0]
     return number.index_select(0, some), span.index_select(1, some)
@@ -121,8 +127,9 @@ def _result(
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
     near, far, start = pixels.lines.parts[2].unbind(1)
     outcome = torch.where(state.hit <= state.far, int(Outcome.HIT), int(Outcome.ESCAPED))
-    outcome = outcome.masked_fill(state.hit < near.index_select(0, number), int(Outcome.INSIDE))
     outcome = outcome.index_fill(0, left, int(Outcome.EXHAUSTED))
+    begun = torch.where(state.least <= 0, int(Outcome.INSIDE), int(Outcome.EXHAUSTED))  # least is NaN where f is
+    outcome = torch.where(state.value >= UNKNOWN, begun, outcome)
     hit = outcome == int(Outcome.HIT)
     found = torch.stack([torch.where(hit, state.hit, torch.inf), torch.where(hit, state.hit, state.closest)])
     beside = torch.where(near < far, pixels.lines.middle().maximum(near), torch.inf)
