@@ -47,9 +47,9 @@ def march_cones(
 ) -> Float[Tensor, "3 n"]:
     """Moves each block's cone on while the ball around its middle ray that f keeps clear covers the cone.
 
-    `span` tells from where and up to where a cone may see surface, and where it began; its radius is width + growth · t.
-    A ball of radius r at t covers the cone up to t + √(r² − ρ²), where ρ is the cone's radius at t + r at the farthest.
-    Values are good to an `error`, which is taken off.
+    `span` tells from where and up to where a cone may see surface, where it began. Its radius is width + growth · t.
+    A ball of radius r at t covers the cone up to t + √(r² − ρ²), where ρ is its radius at t + r at the farthest. Values
+    are good to an `error`, which is taken off.
     """
     t, far, begin = span.unbind(0)
     for _ in range(looks):
