@@ -5,6 +5,7 @@ from collections import Counter
 import numpy as np
 import pytest
 import torch
+from bumpy import bumpy_balls
 from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -282,6 +283,16 @@ def test_every_hit_on_a_decoder_lies_on_its_surface(model: str, code: int) -> No
             buffers = render(sdf, view(24, azimuth=azimuth))
             assert buffers.mask.sum() > 20
             assert sdf(buffers.points).abs().max() < 1e-3
+
+
+def test_a_rough_value_that_was_wrong_puts_no_hit_in_the_air() -> None:
+    """Exact looks find some of these rays inside before the place up to which rough ones called them clear."""
+    sdf = bumpy_balls(0.4).field(torch.tensor([0.4, -0.3, 0.2, -0.4]))
+    with torch.no_grad():
+        for k in range(10):
+            buffers = render(sdf, view(56, 36.0 * k, 10 + 15.0 * (k % 3), 2.8, focal_px=70.0))
+            assert buffers.mask.sum() > 500
+            assert sdf(buffers.points).abs().max() < 2e-3
 
 
 @pytest.mark.parametrize("shapes", [1, 2])

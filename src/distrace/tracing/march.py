@@ -86,7 +86,7 @@ def march(
         allowed = some.of_view(gap)
         probes = max(1, math.isqrt(states.shape[1] * number // (PATIENCE * len(active))))
         t, before, after, at = _looked(values, some, state, probes, allowed, zero)
-        step = at - t
+        step = (at - t).clamp_min(1e-7)  # an exact look may lie before a rough one
         covered = before + after + allowed >= step
         clear = covered & (after > zero)
         crossed = after <= -zero
