@@ -367,7 +367,6 @@ def test_the_posters_view_takes_few_calls_of_the_field(counts) -> None:
     assert counts[512]["calls"] <= 60
 
 
-@pytest.mark.xfail(strict=True, reason="2,400 operations, 550 of them the network's own")
 def test_the_posters_view_takes_few_operations(counts) -> None:
     assert counts[512]["operations"] <= 2000
 

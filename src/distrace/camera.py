@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from distrace.equality import ByValue
 from distrace.rays import Rays
@@ -101,8 +102,7 @@ class Camera(ByValue):
     def pixels(self) -> Float[Tensor, "height width 2"]:
         """The centres (x, y) of all pixels."""
         like = self.intrinsics
-        y = torch.arange(self.height, dtype=like.dtype, device=like.device) + 0.5
-        x = torch.arange(self.width, dtype=like.dtype, device=like.device) + 0.5
+        y, x = (torch.arange(0.5, size, dtype=like.dtype, device=like.device) for size in (self.height, self.width))
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
     def rays(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Rays:
@@ -121,7 +121,7 @@ class Camera(ByValue):
         directions = (rotation @ (ahead / depth_one[..., None])[..., None])[..., 0]
         origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
         focal = self.intrinsics[..., 0, 0].reshape(*batch, *axes)
-        return Rays(origins, directions), 1 / depth_one, 1 / (depth_one.square() * focal)
+        return Rays(origins, directions), depth_one.reciprocal(), (depth_one.square() * focal).reciprocal()
 
     def project(self, points_world: Float[Tensor, "*points 3"]) -> tuple[Tensor, Tensor]:
         """Pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""
@@ -199,8 +199,7 @@ class Camera(ByValue):
         """Points at depth 1 seen by pixels, in the camera's axes."""
         axes = (1,) * (pixels.dim() - 1)
         inverse = torch.linalg.inv(self.intrinsics).reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
-        homogeneous = torch.cat([pixels, torch.ones_like(pixels[..., :1])], dim=-1)
-        return (inverse @ homogeneous[..., None])[..., 0]
+        return (inverse @ pad(pixels, (0, 1), value=1.0)[..., None])[..., 0]
 
 
 def _check_size(height: int, width: int) -> None:

@@ -79,7 +79,7 @@ class LaidOut(Rounded):
     def _layers(self) -> list[Layer]:
         """Weights, and biases in the precision that they are added in."""
         linears = [getattr(self.decoder, f"lin{layer}") for layer in range(self.decoder.depth)]
-        layers = [(linear.weight.detach(), linear.bias.detach()) for linear in linears]
+        layers = [(linear.weight, linear.bias) for linear in linears]
         return [(w, b if self.decoder.is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
 
     @cached_property

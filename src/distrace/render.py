@@ -221,8 +221,11 @@ def _marched(sdf: SDF, camera: Camera, rays: Rays, radius: float, config: TraceC
 
 def _warn(trace: Trace) -> None:
     """Says what a user should not take for a clean picture."""
+    counts = torch.bincount(trace.outcome.reshape(-1), minlength=len(Outcome)).tolist()
+    exhausted, inside = counts[Outcome.EXHAUSTED], counts[Outcome.INSIDE]
+    if not exhausted and not inside:
+        return
     met = int(torch.isfinite(trace.closest).sum())
-    exhausted = int((trace.outcome == Outcome.EXHAUSTED).sum())
     if exhausted > DOUBTFUL * met:
         warnings.warn(
             f"{exhausted} of {met} rays ended without an answer (EXHAUSTED): the field is NaN there, or steeper than"
@@ -230,7 +233,7 @@ def _warn(trace: Trace) -> None:
             DoubtfulResult,
             stacklevel=3,
         )
-    elif met and int((trace.outcome == Outcome.INSIDE).sum()) == met:
+    elif inside == met:
         warnings.warn(
             f"all {met} rays start inside the solid; is the camera in it, or the field's sign inverted (it is positive"
             " outside)?",

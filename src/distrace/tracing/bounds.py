@@ -1,5 +1,6 @@
 """Where a surface can be: an octree of cell centres, each of which excludes a ball by a Lipschitz constant of f."""
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -7,11 +8,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from distrace.batch_field import BatchField
+from distrace.field import SDF
 from distrace.rays import Bounds, Rays
 from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import Lines
 
 CELLS = 16  # along the diameter of the unit sphere; those that may hold surface are split once
+CORNERS = tuple(itertools.product((-1, 1), repeat=3))  # of a cell, and where the parts of a block of cells are
 HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
 MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies between the samples
 SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: less than half a cell apart
@@ -28,6 +32,7 @@ class Occupancy:
     values: Float[Tensor, "shapes m m m"]  # of f at the centres of the coarser cells, in radii
     radius: float
     evaluations: int
+    cheap: SDF | BatchField | None = None  # the field by rougher products, where those are faster on this machine
 
     def entered(self, lines: Lines) -> Float[Tensor, "3 n"]:
         """From the first to the last cell on the way of each ray that may hold surface, and from the first again.
@@ -36,17 +41,13 @@ class Occupancy:
         Cells are looked at by samples along the ray.
         """
         cells = self.occupied.shape[-1]
-        middle = lines.middle()
-        nearest = lines.at(middle).square().sum(1)
-        half = ((1 + 2 / cells) ** 2 - nearest).clamp_min(0).sqrt()
-        near = (middle - half).clamp_min(0)
-        apart = (middle + half - near).clamp_min(0) / SAMPLES
+        near, far = lines.within(1 + 2 / cells)  # of a block, other rays than the middle one may be in the sphere
+        apart = (far - near).clamp_min(0) / SAMPLES
         order = torch.arange(SAMPLES, dtype=near.dtype, device=near.device)[:, None]
         cell = ((lines.at(torch.addcmul(near, order + 0.5, apart)) + 1) * (cells / 2)).long().clamp_(0, cells - 1)
-        place = cell @ cell.new_tensor([cells * cells, cells, 1])
-        if len(self.occupied) > 1 and lines.view is not None:
-            place = place + lines.view * cells**3
-        held = self.occupied.reshape(-1)[place]
+        shape = 0 if len(self.occupied) == 1 or lines.view is None else lines.view
+        x, y, z = cell.unbind(-1)
+        held = self.occupied[shape, x, y, z]
         first = torch.where(held, order, torch.inf).amin(0)
         last = torch.where(held, order + 1, -torch.inf).amax(0)
         return torch.addcmul(near, torch.stack([first, last, first]), apart)
@@ -78,9 +79,8 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     """
     shapes, width = evaluator.shapes, 2 / CELLS
     along = torch.arange(-1 + width / 2, 1, width, dtype=like.dtype, device=like.device)
-    centres = torch.cartesian_prod(along, along, along)
-    signs = like.new_tensor([-1, 1])
-    corners = torch.cartesian_prod(signs, signs, signs)  # of a cell, and where the parts of a block of cells are
+    centres = torch.stack(torch.meshgrid(along, along, along, indexing="ij"), dim=-1).reshape(-1, 3)
+    corners = like.new_tensor(CORNERS)
     shape = torch.arange(shapes, device=like.device)
     values = evaluator.at(centres.repeat(shapes, 1), shape.repeat_interleave(len(centres)), rough=True)
     coarse = values.reshape(shapes, *[CELLS] * 3)
@@ -103,7 +103,7 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     x, y, z = ((children + 1) * CELLS).long().reshape(-1, 3).unbind(1)
     occupied[whose, x, y, z] = (~(fine > width / 2 * HALF_DIAGONAL * bound[whose])).to(like.dtype)
     beside = F.max_pool3d(occupied[:, None], 3, 1, 1)[:, 0] > 0
-    return Occupancy(beside, bound, coarse, evaluator.radius, evaluator.evaluations)
+    return Occupancy(beside, bound, coarse, evaluator.radius, evaluator.evaluations, evaluator.cheap)
 
 
 def _mean_slope(

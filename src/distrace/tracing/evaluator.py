@@ -17,14 +17,13 @@ class Evaluator:
     """Values along rays, in radii of the sphere, divided by the Lipschitz constant once it is known.
 
     `rough` values are in cheaper products, where this machine has them, and good to `error`; elsewhere they are exact,
-    and the error is zero.
+    and the error is zero. `cheap` is what `cheaper` gives for the field.
     """
 
-    def __init__(self, sdf: SDF | BatchField, radius: float) -> None:
+    def __init__(self, sdf: SDF | BatchField, radius: float, cheap: SDF | BatchField | None = None) -> None:
         self.sdf, self.radius = sdf, radius
         self.shapes = len(sdf) if isinstance(sdf, BatchField) else 1
-        cheap = rough_field(sdf)
-        self.cheap = sdf if cheap is None else cheap
+        self.cheap = cheap
         self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
         self.scale: Tensor | None = None  # [shapes]
         self.evaluations = 0
@@ -41,7 +40,7 @@ class Evaluator:
     ) -> Float[Tensor, "*k n"]:
         """Values at points of the unit sphere, each of the shape of its number."""
         self.evaluations += points.numel() // 3
-        field = self.cheap if rough else self.sdf
+        field = self.cheap if rough and self.cheap is not None else self.sdf
         world = points if self.radius == 1 else points * self.radius
         if isinstance(field, BatchField):
             each = torch.zeros_like(points[..., 0], dtype=torch.int64) if shape is None else shape
@@ -55,11 +54,11 @@ class Evaluator:
 
     def normalise(self, lipschitz: Float[Tensor, "shapes"]) -> None:
         """From here on |f| is at most the distance to the surface."""
-        self.scale = 1 / (self.radius * lipschitz)
+        self.scale = (self.radius * lipschitz).reciprocal()
         self.error = self.error / float(lipschitz.min()) if self.error else 0.0
 
 
-def rough_field(sdf: SDF | BatchField) -> SDF | BatchField | None:
+def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
     """A decoder's field in bfloat16 products, where those are faster on this machine; else none."""
     code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
     decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None

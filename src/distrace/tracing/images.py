@@ -19,28 +19,33 @@ BRANCH = 3  # blocks split into 3 × 3: the middle part keeps the ray of the who
 class Lines:
     """Rays that are traced together. They start where the sphere comes nearest to their camera, in radii."""
 
-    table: Float[Tensor, "n 9"]  # origin, direction; where it enters and leaves the sphere (−inf: never), and starts
+    table: Float[Tensor, "n 8"]  # origin, direction, how far to the sphere's middle, and 1 − (how far past it)²
     view: Int[Tensor, "n"] | None  # the image of each, and its shape; none where there is but one
 
-    def __len__(self) -> int:
-        return len(self.table)
+    @staticmethod
+    def of(origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], view: Int[Tensor, "n"] | None) -> "Lines":
+        middle = -(origins * directions).sum(1, keepdim=True)
+        inside = 1 - torch.addcmul(origins, middle, directions).square().sum(1, keepdim=True)
+        return Lines(torch.cat([origins, directions, middle, inside], dim=1), view)
 
     def __getitem__(self, some: Int[Tensor, "m"]) -> "Lines":
         view = None if self.view is None else self.view.index_select(0, some)
         return Lines(self.table.index_select(0, some), view)
 
     @cached_property
-    def parts(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"]]:
+    def parts(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 2"]]:
         """Origins, directions, and the rest."""
-        origins, directions, rest = self.table.split(3, 1)
+        origins, directions, rest = self.table.split([3, 3, 2], 1)
         return origins, directions, rest
 
     def at(self, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n 3"]:
         return torch.addcmul(self.parts[0], t[..., None], self.parts[1])
 
-    def middle(self) -> Float[Tensor, "n"]:
-        """How far each ray goes to come nearest to the sphere's middle; negative behind its origin."""
-        return -(self.parts[0] * self.parts[1]).sum(1)
+    def within(self, radius: float = 1.0) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """From where to where each ray is in a sphere of this radius; near ≥ far where it never is."""
+        middle, inside = self.parts[2].unbind(1)
+        half = (inside if radius == 1 else inside + (radius**2 - 1)).clamp_min(0).sqrt()
+        return (middle - half).clamp_min(0), middle + half
 
     def of_view(self, each: Float[Tensor, "views"]) -> Float[Tensor, "#n"]:
         """What is known of each view, for each ray."""
@@ -52,9 +57,11 @@ class Pixels:
     """All rays that may be traced, by number; those of images in a grid that is padded to whole blocks."""
 
     lines: Lines
+    start: Float[Tensor, "#n"]  # how far the origins are from the camera
     width: Float[Tensor, "views"]  # of a pixel at the origins …
     growth: Float[Tensor, "views"]  # … and by how much per unit of distance
     shape: tuple[int, int, int]  # views, rows, columns; with the padding
+    size: tuple[int, ...]  # … and without it
     level: int = 0  # the largest blocks have BRANCH ** level pixels a side
 
     @staticmethod
@@ -74,19 +81,17 @@ class Pixels:
         right, down, ahead = (rotation @ inverse)[:, None, None].unbind(-1)
         directions = normalize(right * x[:, None] + (down * y[:, None, None] + ahead), dim=-1)
         origins = torch.addcmul(eye[:, None, None], shift[:, None, None, None], directions)
-        start = shift[:, None, None].expand(views, rows, columns)
-        table = _table(origins, directions, start)
-        table[:, camera.height :, :, 7] = table[:, :, camera.width :, 7] = -torch.inf  # the padding sees nothing
         view = None if views == 1 else torch.arange(views, device=eye.device).repeat_interleave(rows * columns)
-        return Pixels(Lines(table.reshape(-1, 9), view), growth * shift, growth, (views, rows, columns), level)
+        lines = Lines.of(origins.reshape(-1, 3), directions.reshape(-1, 3), view)
+        size = (*camera.intrinsics.shape[:-2], camera.height, camera.width)
+        return Pixels(lines, lines.of_view(shift), growth * shift, growth, (views, rows, columns), size, level)
 
     @staticmethod
     def of_rays(rays: Rays) -> "Pixels":
         """Rays that are no image, from where they enter a sphere of twice the radius."""
         start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
-        lines = Lines(_table(rays.at(start), rays.directions, start), None)
-        zero = start.new_zeros(1)
-        return Pixels(lines, zero + torch.inf, zero, (1, 1, len(start)))
+        lines, zero, count = Lines.of(rays.at(start), rays.directions, None), start.new_zeros(1), len(start)
+        return Pixels(lines, start, zero + torch.inf, zero, (1, 1, count), (count,))
 
     def blocks(self) -> Int[Tensor, "n"]:
         """The middle rays of all of the largest blocks."""
@@ -101,12 +106,12 @@ class Pixels:
         around = (offset[:, None] * self.shape[2] + offset).reshape(-1)
         return (blocks[:, None] + around).reshape(-1)
 
-
-def _table(
-    origins: Float[Tensor, "*n 3"], directions: Float[Tensor, "*n 3"], start: Float[Tensor, "*n"]
-) -> Float[Tensor, "*n 9"]:
-    bounds = meet_sphere(Rays(origins, directions))
-    return torch.cat([origins, directions, torch.stack([bounds.near, bounds.far, start], dim=-1)], dim=-1)
+    def image(self, each: Float[Tensor, "k n"]) -> Float[Tensor, "k *size"]:
+        """What is known of each ray, without the padding."""
+        whole = each.reshape(-1, *self.shape)
+        if len(self.size) > 1:
+            whole = whole[..., : self.size[-2], : self.size[-1]]
+        return whole.reshape(-1, *self.size)
 
 
 def reach(side: int) -> float:

@@ -5,35 +5,41 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
+from torch.nn import functional as F
 
 from distrace.tracing.images import Lines
 
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
-UNKNOWN = 1e3  # radii: the value at a start that was not looked at
-BRACKET = 8.0  # tolerances: in a shorter one the root of the line is taken
-PATIENCE = 8  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
+NEVER = 1e3  # radii: farther than any place on a ray
+PATIENCE = 6  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
 
 
 class State(NamedTuple):
-    """What is known of rays, in radii. Each is clear up to `t`, but for gaps."""
+    """What is known of rays, in radii. Each is clear up to `t`, but for gaps. The last four stay as they are."""
 
     t: Float[Tensor, "n"]
-    value: Float[Tensor, "n"]  # of f at t
-    at: Float[Tensor, "n"]  # where f is looked at next
-    high: Float[Tensor, "n"]  # the nearest point inside; infinite while there is none
-    far: Float[Tensor, "n"]  # beyond there is no surface
+    value: Float[Tensor, "n"]  # of f at t; NEVER if that is not known
+    at: Float[Tensor, "n"]  # where f is looked at next; when the ray is done, where it is hit, or beyond `far`
+    high: Float[Tensor, "n"]  # the nearest point inside
     least: Float[Tensor, "n"]  # f so far …
     closest: Float[Tensor, "n"]  # … and where that was
-    hit: Float[Tensor, "n"]  # NaN until there is one
     looks: Float[Tensor, "n"]  # evaluations of f
+    done: Float[Tensor, "n"]  # 0 until nothing more is to be looked at
+    far: Float[Tensor, "n"]  # beyond there is no surface
+    gap: Float[Tensor, "n"]  # half of what the balls around two samples may leave between them
+    tolerance: Float[Tensor, "n"]  # how far off a hit may be …
+    bracket: Float[Tensor, "n"]  # … and in how short a bracket the root of the line is taken
 
     @staticmethod
-    def of_spans(t: Float[Tensor, "n"], far: Float[Tensor, "n"]) -> "State":
-        """Of rays that are clear before t."""
-        never, zero = torch.full_like(t, torch.inf), torch.zeros_like(t)
-        return State(t, zero + UNKNOWN, t, never, far, never, t, never * 0, zero)
+    def of_spans(t: Float[Tensor, "n"], *known: Float[Tensor, "n"]) -> "State":
+        """Of rays that are clear before t, with what stays as it is."""
+        zero, never = torch.zeros_like(t), torch.full_like(t, NEVER)
+        return State(t, never, t, never, never, t, zero, zero, *known)
+
+
+CHANGING = State._fields.index("far")  # facts
 
 
 def march_cones(
@@ -62,75 +68,72 @@ def march_cones(
 def march(
     values: Values,
     lines: Lines,
-    states: Float[Tensor, "9 n"],
+    states: Float[Tensor, "12 n"],
     active: Int[Tensor, "m"],
     looks: int,
-    gap: Float[Tensor, "views"],
-    tolerance: Float[Tensor, "views"],
     error: float | None = None,
-) -> Int[Tensor, "left"]:
-    """Looks at the active rays in lock step; writes what became of them to `states`, returns those without a result.
+) -> None:
+    """Looks at the active rays in lock step, and writes what became of them to `states`.
 
-    A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
-    where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
-    the gap. In a bracket it is no longer than half. A ray is hit where f, outside, is too small for the line's root to
-    be none, or in a short bracket. When few rays are left each is looked at in several places at once. Values that are
-    good to an `error` never decide on a hit: rays where f is no greater are left alone.
+    When few rays are left each is looked at in several places at once. Values that are good to an `error` never decide
+    on a hit: rays where f is no greater are left alone.
     """
-    zero, half, short = error or 0.0, gap / 2, BRACKET * tolerance
+    changing = states[:CHANGING]
     for number in range(looks):
         if not len(active):
             break
-        some = lines[active]
-        state = State(*states.index_select(1, active).unbind(0))
-        allowed = some.of_view(gap)
+        some, state = lines[active], State(*states.index_select(1, active).unbind(0))
         probes = max(1, math.isqrt(states.shape[1] * number // (PATIENCE * len(active))))
-        t, before, after, at = _looked(values, some, state, probes, allowed, zero)
-        step = (at - t).clamp_min(1e-7)  # an exact look may lie before a rough one
-        covered = before + after + allowed >= step
-        clear = covered & (after > zero)
-        crossed = after <= -zero
-        known = covered | crossed
-        moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
-        falling = ((after - before) / step).clamp(-1, -1e-6)
-        level = some.of_view(tolerance) * falling * falling
-        root = torch.addcdiv(at, after, falling, value=-1)
-        aim = torch.addcdiv(at, torch.sub(after, level, alpha=0.5), falling, value=-1)
-        balls = torch.addcdiv(at, torch.add(some.of_view(half), after, alpha=2), 1 - falling)
-        onward = torch.minimum(torch.minimum(aim, balls), (moved + state.high) / 2)
-        following = torch.where(known, onward, moved + value + allowed)
-        high = torch.where(crossed, at, state.high)
-        going, hit = moved < state.far, state.hit
-        if error is None:
-            seen = before < UNKNOWN
-            found = ((value < level) | (crossed & (step < some.of_view(short)))) & seen
-            hit = torch.where(found, torch.minimum(root, high), hit)
-            going = (going > found) & (clear | seen)
+        if probes == 1:
+            found = torch.stack(_advanced(state._replace(looks=state.looks + 1), values(some, state.at), error))
         else:
-            going = going & (clear | ~known)
-        closest, least = torch.where(after < state.least, at, state.closest), torch.minimum(after, state.least)
-        new = State(moved, value, following, high, state.far, least, closest, hit, state.looks + probes)
-        states.index_copy_(1, active, torch.stack(new))
-        active = active.index_select(0, going.nonzero()[:, 0])
-    return active
+            found = _first(state, values, some, probes, error)
+        changing.index_copy_(1, active, found)
+        active = active[found[CHANGING - 1] == 0]
 
 
-def _looked(
-    values: Values, lines: Lines, state: State, probes: int, gap: Float[Tensor, "#n"], zero: float
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Two neighbouring samples of each ray, t, f(t), f(t') and t': the first pair of those that may not be passed."""
-    if probes == 1:
-        return state.t, state.value, values(lines, state.at), state.at
-    step = torch.minimum(state.at - state.t, (state.high - state.t) / (probes + 1))
+def _first(state: State, values: Values, lines: Lines, probes: int, error: float | None) -> Float[Tensor, "8 n"]:
+    """Looks ahead in several places, and tells what is known after the first that the ray may not pass."""
+    step = state.at.minimum(state.t.lerp(state.high, 1 / (probes + 1))) - state.t
     order = torch.arange(probes + 1, dtype=step.dtype, device=step.device)[:, None]
     along = torch.addcmul(state.t, order, step)
-    ahead = torch.cat([state.value[None], values(lines, along[1:])])
-    before, after = ahead[:-1], ahead[1:]
-    outside = after > zero
-    passes = outside & (before + after + gap >= step)
-    passes[:-1].logical_and_((2 * after > before)[:-1] | ~outside[1:])  # not where the line has a root before the next
-    first = passes.long().cumprod(0).sum(0, keepdim=True).clamp_max(probes - 1)
-    pair = torch.cat([first, first + 1])
-    t, at = along.gather(0, pair).unbind(0)
-    before, after = ahead.gather(0, pair).unbind(0)
-    return t, before, after, at
+    at = along[1:]
+    after = values(lines, at)
+    high, looks = (each.expand_as(after) for each in (state.high, state.looks + probes))
+    before = torch.cat([state.value[None], after[:-1]])
+    each = state._replace(t=along[:-1], value=before, at=at, high=high, looks=looks)
+    found = torch.stack(_advanced(each, after, error))
+    passes = (found[0] == at) & (2 * after > before)  # the line has no root before the next place
+    first = F.pad(passes[:-1].to(torch.uint8), (0, 0, 0, 1)).argmin(0)
+    return found.gather(1, first.expand(CHANGING, 1, -1))[:, 0]
+
+
+def _advanced(state: State, after: Float[Tensor, "*k n"], error: float | None) -> list[Shaped[Tensor, "*k n"]]:
+    """What is known after f was looked at, of all that changes.
+
+    A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
+    where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
+    the gap. In a bracket, and where it does not count, it is no longer than half. A ray is hit where f, outside, is too
+    small for the line's root to be none, or in a short bracket.
+    """
+    t, before, at, high, least, closest, looks, _, far, gap, tolerance, bracket = state
+    step = (at - t).clamp_min(1e-12)  # an exact look may lie before a rough one
+    joined = torch.add(before + after, gap, alpha=2) >= step
+    inside = after <= (error or 0.0)
+    clear = joined > inside
+    moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
+    slope = ((before - after) / step).clamp(1e-6, 1)  # downwards
+    level = tolerance * slope
+    root = torch.addcdiv(at, after, slope)
+    aim = torch.sub(root, level, alpha=0.5)
+    balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
+    middle = torch.lerp(moved, torch.where(joined, high, at), 0.5)
+    following = torch.minimum(torch.minimum(aim, balls), middle)
+    done = inside
+    if error is None:
+        high = torch.where(inside, at, high)
+        done = (value < level * slope) | (inside & (step < bracket))
+        following = torch.where(done, root, following)
+    done = done | (moved >= far)
+    closest, least = torch.where(after < least, at, closest), torch.minimum(after, least)
+    return [moved, value, following, high, least, closest, looks, done]

@@ -13,14 +13,15 @@ from distrace.field import SDF
 from distrace.rays import Rays
 from distrace.trace import Outcome, Trace
 from distrace.tracing.bounds import Occupancy, find_occupancy
-from distrace.tracing.evaluator import Evaluator
+from distrace.tracing.evaluator import Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
-from distrace.tracing.march import UNKNOWN, State, march, march_cones
+from distrace.tracing.march import NEVER, State, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
 ROUGH_LOOKS = 5  # looks by rough values, at the cones of each level and at single rays …
 LOOKS = 48  # … and by exact ones: rays that graze the surface take many
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
+BRACKET = 8.0  # tolerances: in a shorter bracket the root of the line is taken
 FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
@@ -57,9 +58,7 @@ def trace_images(
     if isinstance(sdf, BatchField) and len(sdf) != views:
         raise ValueError(f"a field of {len(sdf)} shapes and {views} cameras were given; give a camera for each shape")
     pixels = Pixels.of_camera(camera, radius, LARGEST)
-    trace, occupancy = _traced(sdf, pixels, radius, config, occupancy)
-    trace = trace.reshaped(torch.Size(pixels.shape))[..., : camera.height, : camera.width]
-    return trace.reshaped(torch.Size([*camera.intrinsics.shape[:-2], camera.height, camera.width])), occupancy
+    return _traced(sdf, pixels, radius, config, occupancy)
 
 
 @torch.no_grad()
@@ -75,16 +74,12 @@ def trace_rays(
 def _traced(
     sdf: SDF | BatchField, pixels: Pixels, radius: float, config: TracerConfig, occupancy: Occupancy | None
 ) -> tuple[Trace, Occupancy]:
-    evaluator = Evaluator(sdf, radius)
     if occupancy is None:
+        evaluator = Evaluator(sdf, radius, cheaper(sdf))
         occupancy = find_occupancy(evaluator, pixels.width, config.lipschitz)
-    elif occupancy.radius != radius:
-        raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
-    elif len(occupancy.occupied) != evaluator.shapes:
-        given = len(occupancy.occupied)
-        raise ValueError(
-            f"an occupancy of {given} shapes was given with a field of {evaluator.shapes}; leave the occupancy out"
-        )
+    else:
+        _check(occupancy, sdf, radius)
+        evaluator = Evaluator(sdf, radius, occupancy.cheap)
     evaluator.normalise(occupancy.lipschitz)
     number = pixels.blocks()
     span = occupancy.entered(pixels.lines[number])
@@ -94,47 +89,56 @@ def _traced(
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
         span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS, evaluator.error)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
-    setup = evaluator.evaluations
-    near, far, _ = pixels.lines[number].parts[2].unbind(1)
+    near, far = pixels.lines[number].within()
     begin = span[2].maximum(near)
     number, span = _within(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
     lines, begin = pixels.lines[number], span[2]
-    states = torch.stack(State.of_spans(span[0], span[1]))
-    left = torch.arange(len(number), device=number.device)
     pixel = pixels.width + pixels.growth  # in the middle of the sphere
-    limits = (2 * pixel).clamp_max(GAP), (FINE * pixel).clamp_max(config.tolerance)
+    limits = [pixel.clamp_max(GAP / 2), (FINE * pixel).clamp_max(config.tolerance)]
+    limits = [lines.of_view(each).expand_as(begin) for each in [*limits, BRACKET * limits[1]]]
+    states = torch.stack(State.of_spans(span[0], span[1], *limits))
+    left = torch.arange(len(number), device=number.device)
     if evaluator.error:
-        march(evaluator.rough, lines, states, left, ROUGH_LOOKS, *limits, evaluator.error)
-        left = (states[0] < states[4]).nonzero()[:, 0]
-    left = march(evaluator.exact, lines, states, left, LOOKS, *limits)
-    within = ((states[1] >= UNKNOWN) & (begin < states[0])).nonzero()[:, 0]
+        march(evaluator.rough, lines, states, left, ROUGH_LOOKS, evaluator.error)
+        left = (states[0] < span[1]).nonzero()[:, 0]
+    march(evaluator.exact, lines, states, left, LOOKS)
+    state = State(*states.unbind(0))
+    within = ((state.value >= NEVER) & (begin < state.t)).nonzero()[:, 0]
     if len(within):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
-        again = State.of_spans(begin[within], span[1, within])
-        states[:, within] = torch.stack(again._replace(looks=states[8, within]))
-        left = torch.cat([left, march(evaluator.exact, lines, states, within, LOOKS, *limits)])
-    return _result(pixels, number, State(*states.unbind(0)), left, radius, setup), occupancy
+        again = State.of_spans(begin[within], span[1, within], *(limit[within] for limit in limits))
+        states[:, within] = torch.stack(again._replace(looks=state.looks[within]))
+        march(evaluator.exact, lines, states, within, LOOKS)
+    return _result(pixels, number, state, radius, evaluator.evaluations), occupancy
+
+
+def _check(occupancy: Occupancy, sdf: SDF | BatchField, radius: float) -> None:
+    given, shapes = len(occupancy.occupied), len(sdf) if isinstance(sdf, BatchField) else 1
+    if occupancy.radius != radius:
+        raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
+    if given != shapes:
+        raise ValueError(f"an occupancy of {given} shapes was given with a field of {shapes}; leave the occupancy out")
 
 
 def _within(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Without the rays of which nothing is left."""
-    some = (span[0] < span[1]).nonzero()[:, 0]
-    return number.index_select(0, some), span.index_select(1, some)
+    some = span[0] < span[1]
+    return number[some], span[:, some]
 
 
-def _result(
-    pixels: Pixels, number: Int[Tensor, "n"], state: State, left: Int[Tensor, "left"], radius: float, setup: int
-) -> Trace:
+def _result(pixels: Pixels, number: Int[Tensor, "n"], state: State, radius: float, evaluations: int) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
-    near, far, start = pixels.lines.parts[2].unbind(1)
-    outcome = torch.where(state.hit <= state.far, int(Outcome.HIT), int(Outcome.ESCAPED))
-    outcome = outcome.index_fill(0, left, int(Outcome.EXHAUSTED))
-    begun = torch.where(state.least <= 0, int(Outcome.INSIDE), int(Outcome.EXHAUSTED))  # least is NaN where f is
-    outcome = torch.where(state.value >= UNKNOWN, begun, outcome)
+    outcome = (state.at <= state.far) * int(Outcome.HIT)  # or ESCAPED, which is 0
+    outcome = outcome.masked_fill(state.value >= NEVER, int(Outcome.INSIDE))
+    outcome = outcome.masked_fill(state.done == 0, int(Outcome.EXHAUSTED))
     hit = outcome == int(Outcome.HIT)
-    found = torch.stack([torch.where(hit, state.hit, torch.inf), torch.where(hit, state.hit, state.closest)])
-    beside = torch.where(near < far, pixels.lines.middle().maximum(near), torch.inf)
-    along = torch.stack([torch.full_like(beside, torch.inf), beside])
-    distance, closest = ((along.index_copy_(1, number, found) + start) * radius).unbind(0)
-    counts = number.new_zeros(2, len(beside))
-    outcome, evaluations = counts.index_copy_(1, number, torch.stack([outcome, state.looks.long()])).unbind(0)
-    return Trace(distance, outcome, closest, closest, evaluations, setup_evaluations=setup)
+    found = [torch.where(hit, state.at, torch.inf), torch.where(hit, state.at, state.closest), outcome, state.looks]
+    near, far = pixels.lines.within()
+    beside = torch.where(near < far, (near + far) / 2, torch.inf)
+    zero = torch.zeros_like(near)
+    table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
+    table.index_copy_(1, number, torch.stack([each.to(near.dtype) for each in found]))
+    table[:2].add_(pixels.start).mul_(radius)
+    lengths, counts = pixels.image(table).split(2)
+    distance, closest = lengths.unbind(0)
+    outcome, looks = counts.long().unbind(0)
+    return Trace(distance, outcome, closest, closest, looks, setup_evaluations=evaluations - int(looks.sum()))
