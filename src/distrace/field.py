@@ -117,9 +117,13 @@ class Counted:
         """As the function of that name; what it returns counts here, too."""
         self.evaluations += len(points)
         values, field = narrowed(self.sdf, points)
+        return values, self.counting(field)
 
-        def count(others: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-            self.evaluations += others.numel() // 3
-            return field(others)
+    def counting(self, field: SDF) -> SDF:
+        """Another form of the same field, which counts here, too."""
 
-        return values, count
+        def count(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+            self.evaluations += points.numel() // 3
+            return field(points)
+
+        return count

@@ -68,7 +68,7 @@ class Render:
         camera = orbiting(self).to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
         counted = Counted(opened(self.model, run.device).field(self.code))
-        with torch.no_grad():
+        with torch.no_grad(), run.noticing():
             views = self._saving_first(filmed(counted, cameras, config=self._config()), camera)
             tallies = (
                 [Tally.of(view.trace) for view in views] if self.orbit is None else _movie(run.out, views, self.orbit)
@@ -76,7 +76,8 @@ class Render:
         facts = _facts(tallies, counted.evaluations)
         pixels = self.size * self.size * len(tallies)
         console.print(f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations")
-        run.finish({**facts, "strategy": self.strategy, **({} if self.orbit is None else _each(tallies))})
+        frames = {} if self.orbit is None else _each(tallies)
+        run.finish({**facts, "strategy": self.strategy, **frames, "warnings": run.warnings})
 
     def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
         """The same views; the first leaves its pictures and its arrays, also as an observation for other commands."""

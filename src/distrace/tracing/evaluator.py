@@ -6,7 +6,7 @@ from torch import Tensor
 
 from distrace.batch_field import BatchField
 from distrace.decoder import ShapeField
-from distrace.field import SDF, asked
+from distrace.field import SDF, Counted, asked
 from distrace.quickest import quickest
 from distrace.tracing.images import Lines
 
@@ -60,6 +60,9 @@ class Evaluator:
 
 def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
     """A decoder's field in bfloat16 products, where those are faster on this machine; else none."""
+    if isinstance(sdf, Counted):
+        cheap = cheaper(sdf.sdf)
+        return None if cheap is None else sdf.counting(cheap)
     code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
     decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
     if decoder is None or code is None:
