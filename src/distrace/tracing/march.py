@@ -129,11 +129,11 @@ def _advanced(state: State, after: Float[Tensor, "*k n"], error: float | None) -
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
     middle = torch.lerp(moved, torch.where(joined, high, at), 0.5)
     following = torch.minimum(torch.minimum(aim, balls), middle)
-    done = inside
     if error is None:
         high = torch.where(inside, at, high)
-        done = (value < level * slope) | (inside & (step < bracket))
-        following = torch.where(done, root, following)
-    done = done | (moved >= far)
+        done = (value < level * slope) | (moved >= torch.minimum(high - bracket, far))
+        following = torch.where(done, torch.minimum(root, high), following)
+    else:
+        done = inside | (moved >= far)
     closest, least = torch.where(after < least, at, closest), torch.minimum(after, least)
     return [moved, value, following, high, least, closest, looks, done]
