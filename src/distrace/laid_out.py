@@ -35,7 +35,9 @@ class LaidOut(Rounded):
         return [self._folded(*layer, code) if self.decoder.is_fed(k) else layer for k, layer in enumerate(self._layers)]
 
     def _folded(self, weight: Tensor, bias: Tensor, code: Tensor) -> Layer:
-        return weight[:, -3:].t(), F.linear(code, weight[:, -self._fed : -3], bias)
+        by_code = weight[:, -self._fed : -3]
+        folded = F.linear(code, by_code, bias) if code.dim() > 1 else torch.addmv(bias, by_code, code)
+        return weight[:, -3:].t(), folded
 
     def _run(
         self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None

@@ -90,9 +90,9 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
         bound = MARGIN * steepest.maximum(_steep_gradient(evaluator, centres, coarse.flatten(1), width / 64))
     else:
         bound = like.new_full((shapes,), lipschitz)
-    reach = width * HALF_DIAGONAL * bound
-    excluded = coarse > reach[:, None, None, None]  # where the field gives NaN nothing is
-    uncertain = ~excluded & ~(coarse < -reach[:, None, None, None])
+    reach = (width * HALF_DIAGONAL * bound).reshape(-1, 1, 1, 1)
+    excluded = coarse > reach  # where the field gives NaN nothing is …
+    uncertain = ~(coarse.abs() > reach)  # … and nothing is known
     shape, cell = uncertain.flatten(1).nonzero().unbind(1)
     children = centres[cell][:, None] + width / 4 * corners
     whose = shape.repeat_interleave(8)

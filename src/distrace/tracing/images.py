@@ -59,7 +59,8 @@ class Pixels:
     lines: Lines
     start: Float[Tensor, "#n"]  # how far the origins are from the camera
     width: Float[Tensor, "views"]  # of a pixel at the origins …
-    growth: Float[Tensor, "views"]  # … and by how much per unit of distance
+    growth: Float[Tensor, "views"]  # … by how much per unit of distance …
+    middle: Float[Tensor, "views"]  # … and in the middle of the sphere
     shape: tuple[int, int, int]  # views, rows, columns; with the padding
     size: tuple[int, ...]  # … and without it
     level: int = 0  # the largest blocks have BRANCH ** level pixels a side
@@ -72,26 +73,28 @@ class Pixels:
         eye, rotation = pose[:, :3, 3] / radius, pose[:, :3, :3]
         shift = (eye.norm(dim=1) - 1).clamp_min(0)
         growth = inverse[:, :2, :2].norm(dim=1).amax(1)
-        pixel, level = float((growth * (shift + 1)).max()), 0
+        width = growth * shift
+        middle, level = width + growth, 0
+        pixel = float(middle.max())
         while reach(BRANCH ** (level + 1)) * pixel < largest and BRANCH**level < max(camera.height, camera.width):
             level += 1
         views, side = len(eye), BRANCH**level
         rows, columns = (-(-size // side) * side for size in (camera.height, camera.width))
         x, y = (torch.arange(0.5, size, dtype=eye.dtype, device=eye.device) for size in (columns, rows))
-        right, down, ahead = (rotation @ inverse)[:, None, None].unbind(-1)
-        directions = normalize(right * x[:, None] + (down * y[:, None, None] + ahead), dim=-1)
-        origins = torch.addcmul(eye[:, None, None], shift[:, None, None, None], directions)
+        right, down, ahead = (rotation @ inverse).reshape(-1, 1, 1, 3, 3).unbind(-1)
+        directions = normalize(right * x[:, None] + (down * y.reshape(-1, 1, 1) + ahead), dim=-1)
+        origins = torch.addcmul(eye.reshape(-1, 1, 1, 3), shift.reshape(-1, 1, 1, 1), directions)
         view = None if views == 1 else torch.arange(views, device=eye.device).repeat_interleave(rows * columns)
         lines = Lines.of(origins.reshape(-1, 3), directions.reshape(-1, 3), view)
         size = (*camera.intrinsics.shape[:-2], camera.height, camera.width)
-        return Pixels(lines, lines.of_view(shift), growth * shift, growth, (views, rows, columns), size, level)
+        return Pixels(lines, lines.of_view(shift), width, growth, middle, (views, rows, columns), size, level)
 
     @staticmethod
     def of_rays(rays: Rays) -> "Pixels":
         """Rays that are no image, from where they enter a sphere of twice the radius."""
         start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
         lines, zero, count = Lines.of(rays.at(start), rays.directions, None), start.new_zeros(1), len(start)
-        return Pixels(lines, start, zero + torch.inf, zero, (1, 1, count), (count,))
+        return Pixels(lines, start, zero, zero, zero + torch.inf, (1, 1, count), (count,))
 
     def blocks(self) -> Int[Tensor, "n"]:
         """The middle rays of all of the largest blocks."""

@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -76,40 +76,42 @@ def march(
     """Looks at the active rays in lock step, and writes what became of them to `states`.
 
     When few rays are left each is looked at in several places at once. Values that are good to an `error` never decide
-    on a hit: rays where f is no greater are left alone.
+    on a hit: rays where f is no greater are left alone, and each is looked at in one place.
     """
     changing = states[:CHANGING]
     for number in range(looks):
         if not len(active):
             break
         some, state = lines[active], State(*states.index_select(1, active).unbind(0))
-        probes = max(1, math.isqrt(states.shape[1] * number // (PATIENCE * len(active))))
-        if probes == 1:
-            found = torch.stack(_advanced(state._replace(looks=state.looks + 1), values(some, state.at), error))
+        probes = math.isqrt(states.shape[1] * number // (PATIENCE * len(active)))
+        if probes < 2 or error is not None:
+            found, _, done = _advanced(state._replace(looks=state.looks + 1), values(some, state.at), error)
         else:
-            found = _first(state, values, some, probes, error)
+            found = _first(state, values, some, probes)
+            done = found[CHANGING - 1] > 0
         changing.index_copy_(1, active, found)
-        active = active[found[CHANGING - 1] == 0]
+        active = active[~done]
 
 
-def _first(state: State, values: Values, lines: Lines, probes: int, error: float | None) -> Float[Tensor, "8 n"]:
+def _first(state: State, values: Values, lines: Lines, probes: int) -> Float[Tensor, "8 n"]:
     """Looks ahead in several places, and tells what is known after the first that the ray may not pass."""
-    step = state.at.minimum(state.t.lerp(state.high, 1 / (probes + 1))) - state.t
-    order = torch.arange(probes + 1, dtype=step.dtype, device=step.device)[:, None]
-    along = torch.addcmul(state.t, order, step)
+    end = state.at.minimum(state.t.lerp(state.high, 1 / (probes + 1)))
+    order = torch.arange(probes + 1, dtype=end.dtype, device=end.device)[:, None]
+    along = torch.lerp(state.t, end, order)
     at = along[1:]
     after = values(lines, at)
-    high, looks = (each.expand_as(after) for each in (state.high, state.looks + probes))
     before = torch.cat([state.value[None], after[:-1]])
-    each = state._replace(t=along[:-1], value=before, at=at, high=high, looks=looks)
-    found = torch.stack(_advanced(each, after, error))
-    passes = (found[0] == at) & (2 * after > before)  # the line has no root before the next place
+    looks = (state.looks + probes).expand_as(after)
+    found, clear, _ = _advanced(state._replace(t=along[:-1], value=before, at=at, looks=looks), after, None)
+    passes = clear & (2 * after > before)  # the line has no root before the next place
     first = F.pad(passes[:-1].to(torch.uint8), (0, 0, 0, 1)).argmin(0)
     return found.gather(1, first.expand(CHANGING, 1, -1))[:, 0]
 
 
-def _advanced(state: State, after: Float[Tensor, "*k n"], error: float | None) -> list[Shaped[Tensor, "*k n"]]:
-    """What is known after f was looked at, of all that changes.
+def _advanced(
+    state: State, after: Float[Tensor, "*k n"], error: float | None
+) -> tuple[Float[Tensor, "8 *k n"], Bool[Tensor, "*k n"], Bool[Tensor, "*k n"]]:
+    """What is known after f was looked at, of all that changes; which steps count, and which rays are done.
 
     A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
     where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
@@ -123,17 +125,16 @@ def _advanced(state: State, after: Float[Tensor, "*k n"], error: float | None) -
     clear = joined > inside
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
     slope = ((before - after) / step).clamp(1e-6, 1)  # downwards
-    level = tolerance * slope
     root = torch.addcdiv(at, after, slope)
-    aim = torch.sub(root, level, alpha=0.5)
+    aim = torch.addcmul(root, tolerance, slope, value=-0.5)
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
     middle = torch.lerp(moved, torch.where(joined, high, at), 0.5)
     following = torch.minimum(torch.minimum(aim, balls), middle)
     if error is None:
         high = torch.where(inside, at, high)
-        done = (value < level * slope) | (moved >= torch.minimum(high - bracket, far))
+        done = (value < tolerance * slope * slope) | (moved >= torch.minimum(high - bracket, far))
         following = torch.where(done, torch.minimum(root, high), following)
     else:
         done = inside | (moved >= far)
     closest, least = torch.where(after < least, at, closest), torch.minimum(after, least)
-    return [moved, value, following, high, least, closest, looks, done]
+    return torch.stack([moved, value, following, high, least, closest, looks, done]), clear, done

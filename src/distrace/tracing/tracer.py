@@ -22,7 +22,7 @@ ROUGH_LOOKS = 5  # looks by rough values, at the cones of each level and at sing
 LOOKS = 48  # … and by exact ones: rays that graze the surface take many
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
 BRACKET = 8.0  # tolerances: in a shorter bracket the root of the line is taken
-FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
+FINE = 0.02  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
 @dataclass(frozen=True)
@@ -93,17 +93,16 @@ def _traced(
     begin = span[2].maximum(near)
     number, span = _within(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
     lines, begin = pixels.lines[number], span[2]
-    pixel = pixels.width + pixels.growth  # in the middle of the sphere
-    limits = [pixel.clamp_max(GAP / 2), (FINE * pixel).clamp_max(config.tolerance)]
+    limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(config.tolerance)]
     limits = [lines.of_view(each).expand_as(begin) for each in [*limits, BRACKET * limits[1]]]
     states = torch.stack(State.of_spans(span[0], span[1], *limits))
-    left = torch.arange(len(number), device=number.device)
+    left = every = torch.arange(len(number), device=number.device)
     if evaluator.error:
-        march(evaluator.rough, lines, states, left, ROUGH_LOOKS, evaluator.error)
-        left = (states[0] < span[1]).nonzero()[:, 0]
+        march(evaluator.rough, lines, states, every, ROUGH_LOOKS, evaluator.error)
+        left = every[states[0] < span[1]]
     march(evaluator.exact, lines, states, left, LOOKS)
     state = State(*states.unbind(0))
-    within = ((state.value >= NEVER) & (begin < state.t)).nonzero()[:, 0]
+    within = every[(state.value >= NEVER) & (begin < state.t)]
     if len(within):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
         again = State.of_spans(begin[within], span[1, within], *(limit[within] for limit in limits))
         states[:, within] = torch.stack(again._replace(looks=state.looks[within]))
@@ -133,7 +132,7 @@ def _result(pixels: Pixels, number: Int[Tensor, "n"], state: State, radius: floa
     hit = outcome == int(Outcome.HIT)
     found = [torch.where(hit, state.at, torch.inf), torch.where(hit, state.at, state.closest), outcome, state.looks]
     near, far = pixels.lines.within()
-    beside = torch.where(near < far, (near + far) / 2, torch.inf)
+    beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
     table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
     table.index_copy_(1, number, torch.stack([each.to(near.dtype) for each in found]))
