@@ -186,8 +186,9 @@ def test_a_surface_beyond_the_sphere_is_not_seen() -> None:
     assert buffers.points.norm(dim=1).max() <= 1 + 1e-6
 
 
-def test_a_field_of_nan_is_doubted_and_every_ray_exhausted() -> None:
-    camera = view(16)
+@pytest.mark.parametrize("size", [16, 300])  # without blocks of pixels, and with them
+def test_a_field_of_nan_is_doubted_and_every_ray_exhausted(size: int) -> None:
+    camera = view(size)
     with pytest.warns(DoubtfulResult, match="EXHAUSTED"):
         trace = render(lambda points: torch.full_like(points[..., 0], torch.nan), camera).trace
     outcome = trace.outcome[meet_sphere(camera.rays()).meets]
@@ -195,6 +196,26 @@ def test_a_field_of_nan_is_doubted_and_every_ray_exhausted() -> None:
     assert (outcome == Outcome.EXHAUSTED).all()
     assert (trace.distance == torch.inf).all()
     assert not trace.closest.isnan().any()
+
+
+@pytest.mark.parametrize("size", [32, 200])
+def test_nan_in_a_corner_outside_of_the_sphere_takes_nothing_away(size: int) -> None:
+    ball = P.sphere(0.5)
+
+    def holed(points: Tensor) -> Tensor:
+        return ball(points).masked_fill((points > 0.9).all(-1), torch.nan)
+
+    with torch.no_grad():
+        expected, found = render(ball, view(size)), render(holed, view(size))
+    assert expected.mask.any()
+    assert (found.mask == expected.mask).all()
+
+
+def test_a_lipschitz_constant_is_not_ignored_beside_an_occupancy() -> None:
+    first = render(SOFA, view(16), config=TracerConfig(lipschitz=2.0))
+    render(SOFA, view(16), config=TracerConfig(lipschitz=2.0), occupancy=first.occupancy)
+    with pytest.raises(ValueError, match=r"lipschitz=5\.0 was given with an occupancy for 2"):
+        render(SOFA, view(16), config=TracerConfig(lipschitz=5.0), occupancy=first.occupancy)
 
 
 def test_a_field_of_the_wrong_sign_is_doubted() -> None:

@@ -18,7 +18,7 @@ CELLS = 16  # along the diameter of the unit sphere; those that may hold surface
 CORNERS = tuple(itertools.product((-1, 1), repeat=3))  # of a cell, and where the parts of a block of cells are
 HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
 MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies between the samples
-SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: less than half a cell apart
+SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
 STEEP = 0.97  # share of these gradients that the bound covers: ReLU networks have a few steep facets
 
@@ -28,7 +28,7 @@ class Occupancy:
     """The cells around the unit sphere that may hold surface, and their neighbours, for each shape of a batch."""
 
     occupied: Bool[Tensor, "shapes n n n"]
-    lipschitz: Float[Tensor, "shapes"]  # the bound on |∇f| by which the others were excluded
+    lipschitz: Float[Tensor, "shapes"]  # the bound on |∇f|: no less than that by which the others were excluded
     values: Float[Tensor, "shapes m m m"]  # of f at the centres of the coarser cells, in radii
     radius: float
     evaluations: int
@@ -72,7 +72,7 @@ class Occupancy:
 
 @torch.no_grad()
 def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None = None) -> Occupancy:
-    """Excludes every cell with |f(centre)| > L · (half its diagonal), splits the others, and excludes again.
+    """Excludes every cell with f(centre) > L · (half its diagonal), splits the others, and excludes again.
 
     Without a `lipschitz` constant L is measured: the steepest mean slope over any block of 2 × 2 × 2 cells, and the
     gradient in the cells nearest to the surface. Cells deep in the solid stay occupied: rays may start there.
@@ -99,6 +99,7 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     fine = evaluator.at(children.reshape(-1, 3), whose, rough=True)
     if lipschitz is None:
         bound = bound.scatter_reduce(0, shape, MARGIN * _mean_slope(fine.reshape(-1, 8), corners, width / 2), "amax")
+        bound = bound.clamp_min(torch.finfo(bound.dtype).eps)  # of a constant field
     occupied = F.interpolate((~excluded).to(like.dtype)[:, None], scale_factor=2.0)[:, 0]
     x, y, z = ((children + 1) * CELLS).long().reshape(-1, 3).unbind(1)
     occupied[whose, x, y, z] = (~(fine > width / 2 * HALF_DIAGONAL * bound[whose])).to(like.dtype)
@@ -109,8 +110,8 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
 def _mean_slope(
     blocks: Float[Tensor, "*batch 8"], corners: Float[Tensor, "8 3"], width: float
 ) -> Float[Tensor, "*batch"]:
-    """|∇f| over blocks of cells, by differences averaged over each axis: no more than the steepest slope in them."""
-    return (blocks @ corners).norm(dim=-1) / (4 * width)
+    """|∇f| over blocks of cells, by differences averaged over each axis: at most the steepest slope in them; 0 by NaN."""
+    return (blocks @ corners).norm(dim=-1).nan_to_num(0.0) / (4 * width)
 
 
 def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step: float) -> Float[Tensor, "shapes"]:

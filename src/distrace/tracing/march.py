@@ -58,8 +58,9 @@ def march_cones(
     are good to an `error`, which is taken off.
     """
     t, far, begin = span.unbind(0)
+    zero = span.new_zeros(())
     for _ in range(looks):
-        clear = (values(lines, t) - error).clamp_min(0)
+        clear = torch.fmax(values(lines, t) - error, zero)  # also where f is NaN
         radius = torch.addcmul(width, growth, t + clear)
         t = t + torch.addcmul(clear * clear, radius, radius, value=-1).clamp_min(0).sqrt()
     return torch.stack([t, far, begin])
@@ -113,10 +114,11 @@ def _advanced(
 ) -> tuple[Float[Tensor, "8 *k n"], Bool[Tensor, "*k n"], Bool[Tensor, "*k n"]]:
     """What is known after f was looked at, of all that changes; which steps count, and which rays are done.
 
-    A step ends before the root of the line through the last two values, in the middle of where f counts as a hit, or
-    where the balls around its ends, by the slope, leave half a gap between them; it counts if they leave no more than
-    the gap. In a bracket, and where it does not count, it is no longer than half. A ray is hit where f, outside, is too
-    small for the line's root to be none, or in a short bracket.
+    A step counts if the balls around its ends leave no more than the gap between them. The next one ends at the nearest
+    of these: the root of the line through the last two values (by exact values, in the middle of where f counts as a
+    hit, just before); where the balls around its ends, by the slope, leave half the gap; the middle of the bracket that
+    was known before, or of a step that did not count. A ray is hit where f, outside, is too small for the line's root
+    to be none, or in a short bracket.
     """
     t, before, at, high, least, closest, looks, _, far, gap, tolerance, bracket = state
     step = (at - t).clamp_min(1e-12)  # an exact look may lie before a rough one
@@ -126,7 +128,7 @@ def _advanced(
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
     slope = ((before - after) / step).clamp(1e-6, 1)  # downwards
     root = torch.addcdiv(at, after, slope)
-    aim = torch.addcmul(root, tolerance, slope, value=-0.5)
+    aim = torch.addcmul(root, tolerance, slope, value=-0.5) if error is None else root
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
     middle = torch.lerp(moved, torch.where(joined, high, at), 0.5)
     following = torch.minimum(torch.minimum(aim, balls), middle)

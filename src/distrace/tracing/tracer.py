@@ -29,7 +29,8 @@ FINE = 0.02  # pixels: the tolerance of a hit, where that is less than a configu
 class TracerConfig:
     """`tolerance`: how far off a hit may be, in radii. `lipschitz`: a bound on |∇f|; measured if not given.
 
-    A field that is steeper than the bound may lose what is thin; one that is flatter takes more steps.
+    A field that is steeper than the bound may lose what is thin; one that is flatter takes more steps. An occupancy has
+    the bound that it was measured with, and takes no other.
     """
 
     tolerance: float = 2.5e-4
@@ -78,7 +79,7 @@ def _traced(
         evaluator = Evaluator(sdf, radius, cheaper(sdf))
         occupancy = find_occupancy(evaluator, pixels.width, config.lipschitz)
     else:
-        _check(occupancy, sdf, radius)
+        _check(occupancy, sdf, radius, config.lipschitz)
         evaluator = Evaluator(sdf, radius, occupancy.cheap)
     evaluator.normalise(occupancy.lipschitz)
     number = pixels.blocks()
@@ -110,12 +111,15 @@ def _traced(
     return _result(pixels, number, state, radius, evaluator.evaluations), occupancy
 
 
-def _check(occupancy: Occupancy, sdf: SDF | BatchField, radius: float) -> None:
+def _check(occupancy: Occupancy, sdf: SDF | BatchField, radius: float, lipschitz: float | None) -> None:
     given, shapes = len(occupancy.occupied), len(sdf) if isinstance(sdf, BatchField) else 1
     if occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
     if given != shapes:
         raise ValueError(f"an occupancy of {given} shapes was given with a field of {shapes}; leave the occupancy out")
+    if lipschitz is not None and (occupancy.lipschitz != lipschitz).any():
+        known = f"{float(occupancy.lipschitz.max()):.4g}"
+        raise ValueError(f"lipschitz={lipschitz} was given with an occupancy for {known}; leave the occupancy out")
 
 
 def _within(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
