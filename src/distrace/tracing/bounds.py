@@ -110,7 +110,7 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
 def _mean_slope(
     blocks: Float[Tensor, "*batch 8"], corners: Float[Tensor, "8 3"], width: float
 ) -> Float[Tensor, "*batch"]:
-    """|∇f| over blocks of cells, by differences averaged over each axis: at most the steepest slope in them; 0 by NaN."""
+    """|∇f| over blocks of cells, by differences averaged over each axis: at most the steepest in them; 0 by NaN."""
     return (blocks @ corners).norm(dim=-1).nan_to_num(0.0) / (4 * width)
 
 

@@ -10,7 +10,7 @@ from distrace.field import SDF, Counted, asked
 from distrace.quickest import quickest
 from distrace.tracing.images import Lines
 
-ROUGH_ERROR = 7e-4  # of values: products in bfloat16, of 8 × 512 decoders near their surfaces, but for one in a thousand
+ROUGH_ERROR = 7e-4  # of values: 8 × 512 decoders in bfloat16 near their surfaces, but for one in a thousand
 
 
 class Evaluator:
