@@ -41,7 +41,7 @@ class Occupancy:
         Cells are looked at by samples along the ray.
         """
         cells = self.occupied.shape[-1]
-        near, far = lines.within(1 + 2 / cells)  # of a block, other rays than the middle one may be in the sphere
+        near, far = lines.in_sphere(1 + 2 / cells)  # of a block, other rays than the middle one may be in the sphere
         apart = (far - near).clamp_min(0) / SAMPLES
         order = torch.arange(SAMPLES, dtype=near.dtype, device=near.device)[:, None]
         cell = ((lines.at(torch.addcmul(near, order + 0.5, apart)) + 1) * (cells / 2)).long().clamp_(0, cells - 1)

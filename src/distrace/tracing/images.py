@@ -41,7 +41,7 @@ class Lines:
     def at(self, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n 3"]:
         return torch.addcmul(self.parts[0], t[..., None], self.parts[1])
 
-    def within(self, radius: float = 1.0) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    def in_sphere(self, radius: float = 1.0) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
         """From where to where each ray is in a sphere of this radius; near ≥ far where it never is."""
         middle, inside = self.parts[2].unbind(1)
         half = (inside if radius == 1 else inside + (radius**2 - 1)).clamp_min(0).sqrt()

@@ -13,7 +13,7 @@ from distrace.tracing.images import Lines
 
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 NEVER = 1e3  # radii: farther than any place on a ray
-PATIENCE = 6  # looks after which a ray is looked at in as many places at once as the root of the rays per ray left
+PATIENCE = 6  # a look is at √(looks so far × all rays ÷ (PATIENCE × rays left)) places of each ray
 
 
 class State(NamedTuple):
@@ -39,7 +39,7 @@ class State(NamedTuple):
         return State(t, never, t, never, never, t, zero, zero, *known)
 
 
-CHANGING = State._fields.index("far")  # facts
+CHANGING = State._fields.index("far")  # of the facts, so many
 
 
 def march_cones(
@@ -122,15 +122,15 @@ def _advanced(
     """
     t, before, at, high, least, closest, looks, _, far, gap, tolerance, bracket = state
     step = (at - t).clamp_min(1e-12)  # an exact look may lie before a rough one
-    joined = torch.add(before + after, gap, alpha=2) >= step
+    covered = torch.add(before + after, gap, alpha=2) >= step
     inside = after <= (error or 0.0)
-    clear = joined > inside
+    clear = covered > inside
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
     slope = ((before - after) / step).clamp(1e-6, 1)  # downwards
     root = torch.addcdiv(at, after, slope)
     aim = torch.addcmul(root, tolerance, slope, value=-0.5) if error is None else root
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
-    middle = torch.lerp(moved, torch.where(joined, high, at), 0.5)
+    middle = torch.lerp(moved, torch.where(covered, high, at), 0.5)
     following = torch.minimum(torch.minimum(aim, balls), middle)
     if error is None:
         high = torch.where(inside, at, high)

@@ -85,14 +85,14 @@ def _traced(
     number = pixels.blocks()
     span = occupancy.entered(pixels.lines[number])
     for level in range(pixels.level, 0, -1):
-        number, span = _within(number, span)
+        number, span = _not_empty(number, span)
         lines, cone = pixels.lines[number], reach(BRANCH**level)
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
         span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS, evaluator.error)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
-    near, far = pixels.lines[number].within()
+    near, far = pixels.lines[number].in_sphere()
     begin = span[2].maximum(near)
-    number, span = _within(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
+    number, span = _not_empty(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
     lines, begin = pixels.lines[number], span[2]
     limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(config.tolerance)]
     limits = [lines.of_view(each).expand_as(begin) for each in [*limits, BRACKET * limits[1]]]
@@ -103,11 +103,11 @@ def _traced(
         left = every[states[0] < span[1]]
     march(evaluator.exact, lines, states, left, LOOKS)
     state = State(*states.unbind(0))
-    within = every[(state.value >= NEVER) & (begin < state.t)]
-    if len(within):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
-        again = State.of_spans(begin[within], span[1, within], *(limit[within] for limit in limits))
-        states[:, within] = torch.stack(again._replace(looks=state.looks[within]))
-        march(evaluator.exact, lines, states, within, LOOKS)
+    overshot = every[(state.value >= NEVER) & (begin < state.t)]
+    if len(overshot):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
+        again = State.of_spans(begin[overshot], span[1, overshot], *(limit[overshot] for limit in limits))
+        states[:, overshot] = torch.stack(again._replace(looks=state.looks[overshot]))
+        march(evaluator.exact, lines, states, overshot, LOOKS)
     return _result(pixels, number, state, radius, evaluator.evaluations), occupancy
 
 
@@ -122,7 +122,7 @@ def _check(occupancy: Occupancy, sdf: SDF | BatchField, radius: float, lipschitz
         raise ValueError(f"lipschitz={lipschitz} was given with an occupancy for {known}; leave the occupancy out")
 
 
-def _within(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
+def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Without the rays of which nothing is left."""
     some = span[0] < span[1]
     return number[some], span[:, some]
@@ -135,7 +135,7 @@ def _result(pixels: Pixels, number: Int[Tensor, "n"], state: State, radius: floa
     outcome = outcome.masked_fill(state.done == 0, int(Outcome.EXHAUSTED))
     hit = outcome == int(Outcome.HIT)
     found = [torch.where(hit, state.at, torch.inf), torch.where(hit, state.at, state.closest), outcome, state.looks]
-    near, far = pixels.lines.within()
+    near, far = pixels.lines.in_sphere()
     beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
     table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
