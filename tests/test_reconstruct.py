@@ -222,7 +222,7 @@ def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reco
             bias[0] -= sign * step
     off = ((found[0] - found[1]) / (2 * step) - exact).abs()
     assert off.median() < 1e-7
-    assert off.quantile(0.9) < 1e-5  # of 24; between them are kinks of the colours' network, which are ReLU's
+    assert off.quantile(0.95) < 1e-5  # between them are kinks of the colours' network, which are ReLU's
 
 
 @pytest.fixture

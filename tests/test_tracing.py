@@ -212,8 +212,8 @@ def test_nan_in_a_corner_outside_of_the_sphere_takes_nothing_away(size: int) -> 
 
 
 def test_a_lipschitz_constant_is_not_ignored_beside_an_occupancy() -> None:
-    first = render(SOFA, view(16), config=TracerConfig(lipschitz=2.0))
-    render(SOFA, view(16), config=TracerConfig(lipschitz=2.0), occupancy=first.occupancy)
+    first = render(SOFA, view(16), config=TracerConfig(lipschitz=2.1))
+    render(SOFA, view(16), config=TracerConfig(lipschitz=2.1), occupancy=first.occupancy)
     with pytest.raises(ValueError, match=r"lipschitz=5\.0 was given with an occupancy for 2"):
         render(SOFA, view(16), config=TracerConfig(lipschitz=5.0), occupancy=first.occupancy)
 
@@ -276,7 +276,7 @@ def test_a_batch_of_shapes_and_cameras_is_what_single_calls_give() -> None:
             alone = render(model.field(codes[k]), camera)
             assert alone.mask.sum() > 20
             assert (together.trace.outcome[k] == alone.trace.outcome).all()
-            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=2.5e-4)
+            torch.testing.assert_close(together.distance[k], alone.distance, rtol=0, atol=1e-4)
 
 
 def test_the_gradients_of_a_batch_are_those_of_single_calls() -> None:

@@ -52,8 +52,8 @@ def trace_images(
 ) -> tuple[Trace, Occupancy]:
     """Traces all pixels of a camera, or of a batch of them; the occupancy serves further views of the same field.
 
-    Raises `ValueError` for an occupancy of another radius or number of shapes, and for another number of cameras than
-    of shapes.
+    Raises `ValueError` for an occupancy of another radius, number of shapes or Lipschitz constant, and for another
+    number of cameras than of shapes.
     """
     views = camera.intrinsics.shape[:-2].numel()
     if isinstance(sdf, BatchField) and len(sdf) != views:
@@ -75,12 +75,11 @@ def trace_rays(
 def _traced(
     sdf: SDF | BatchField, pixels: Pixels, radius: float, config: TracerConfig, occupancy: Occupancy | None
 ) -> tuple[Trace, Occupancy]:
+    evaluator = Evaluator(sdf, radius, cheaper(sdf) if occupancy is None else occupancy.cheap)
     if occupancy is None:
-        evaluator = Evaluator(sdf, radius, cheaper(sdf))
         occupancy = find_occupancy(evaluator, pixels.width, config.lipschitz)
     else:
-        _check(occupancy, sdf, radius, config.lipschitz)
-        evaluator = Evaluator(sdf, radius, occupancy.cheap)
+        _check(occupancy, evaluator, config.lipschitz)
     evaluator.normalise(occupancy.lipschitz)
     number = pixels.blocks()
     span = occupancy.entered(pixels.lines[number])
@@ -111,8 +110,8 @@ def _traced(
     return _result(pixels, number, state, radius, evaluator.evaluations), occupancy
 
 
-def _check(occupancy: Occupancy, sdf: SDF | BatchField, radius: float, lipschitz: float | None) -> None:
-    given, shapes = len(occupancy.occupied), len(sdf) if isinstance(sdf, BatchField) else 1
+def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
+    given, shapes, radius = len(occupancy.occupied), evaluator.shapes, evaluator.radius
     if occupancy.radius != radius:
         raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
     if given != shapes:
