@@ -99,7 +99,7 @@ def _bisected(sdf: SDF, rays: Rays, outside: Float[Tensor, "n"], inside: Float[T
 
 
 def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tensor, "height width"]:
-    """By `reference_distance`, with steps that are never longer than a twentieth of a pixel without need."""
+    """By `reference_distance`, whose smallest step is at most a twentieth of a pixel at the sphere's middle."""
     rays = camera.rays()
     away = max(float(camera.T_world_camera[:3, 3].norm()), 0.1 * radius)
     finest = float(camera.pixel_angle().amin()) * away / 20
