@@ -118,7 +118,7 @@ class Camera(ByValue):
         rotation = self.T_world_camera[..., :3, :3].reshape(*batch, *axes, 3, 3)
         ahead = self._ahead(pixels)
         depth_one = ahead.norm(dim=-1)
-        directions = (rotation @ (ahead / depth_one[..., None])[..., None])[..., 0]
+        directions = (rotation * (ahead / depth_one[..., None])[..., None, :]).sum(-1)
         origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
         focal = self.intrinsics[..., 0, 0].reshape(*batch, *axes)
         return Rays(origins, directions), depth_one.reciprocal(), (depth_one.square() * focal).reciprocal()
@@ -199,7 +199,7 @@ class Camera(ByValue):
         """Points at depth 1 seen by pixels, in the camera's axes."""
         axes = (1,) * (pixels.dim() - 1)
         inverse = torch.linalg.inv(self.intrinsics).reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
-        return (inverse @ pad(pixels, (0, 1), value=1.0)[..., None])[..., 0]
+        return (inverse * pad(pixels, (0, 1), value=1.0)[..., None, :]).sum(-1)
 
 
 def _check_size(height: int, width: int) -> None:

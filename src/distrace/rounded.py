@@ -13,7 +13,7 @@ from distrace.field import SDF, flattened, in_chunks
 from distrace.products import Layer
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
-CHUNK = 32_768  # points at a time: each product's output is fresh memory; 65,536 at a time take twice as long
+CHUNK = 1 << 17  # points at a time: a bound on memory
 
 
 class Rounded:

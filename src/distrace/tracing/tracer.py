@@ -1,7 +1,7 @@
 """The default tracer: cells that may hold surface, cones of blocks of pixels, single rays."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float, Int
@@ -15,13 +15,11 @@ from distrace.trace import Outcome, Trace
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
-from distrace.tracing.march import NEVER, State, march, march_cones
+from distrace.tracing.march import ALONE, NEAR, NEVER, ROUGH, Looked, State, evaluations, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
-ROUGH_LOOKS = 5  # looks by rough values, at the cones of each level and at single rays …
-LOOKS = 48  # … and by exact ones: rays that graze the surface take many
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
-BRACKET = 8.0  # tolerances: in a shorter bracket the root of the line is taken
+BRACKET = 2.0  # tolerances: in a shorter bracket the root of the line is taken
 FINE = 0.02  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
@@ -87,27 +85,31 @@ def _traced(
         number, span = _not_empty(number, span)
         lines, cone = pixels.lines[number], reach(BRANCH**level)
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
-        span = march_cones(evaluator.rough, lines, span, width, growth, ROUGH_LOOKS, evaluator.error)
+        wide = torch.addcmul(width, growth, span[1])
+        span = march_cones(evaluator.rough, lines, span, wide, len(ROUGH), evaluator.error)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
     near, far = pixels.lines[number].in_sphere()
     begin = span[2].maximum(near)
     number, span = _not_empty(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
-    lines, begin = pixels.lines[number], span[2]
+    lines = pixels.lines[number]
+    t, far, begin = span.unbind(0)
     limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(config.tolerance)]
-    limits = [lines.of_view(each).expand_as(begin) for each in [*limits, BRACKET * limits[1]]]
-    states = torch.stack(State.of_spans(span[0], span[1], *limits))
+    limits = [lines.of_view(each).expand_as(t) for each in [*limits, BRACKET * limits[1]]]
+    states = torch.stack(State.of_spans(t, far, *limits))
     left = every = torch.arange(len(number), device=number.device)
+    looked: list[Looked] = [(every[:0], 0)]
     if evaluator.error:
-        march(evaluator.rough, lines, states, every, ROUGH_LOOKS, evaluator.error)
-        left = every[states[0] < span[1]]
-    march(evaluator.exact, lines, states, left, LOOKS)
-    state = State(*states.unbind(0))
-    overshot = every[(state.value >= NEVER) & (begin < state.t)]
+        looked += march(evaluator.rough, lines, states, every, ROUGH, evaluator.error)
+        left = every[states[0] < far]
+    looked += march(evaluator.exact, lines, states, left, NEAR if evaluator.error else ALONE)
+    overshot = every[(states[1] >= NEVER) & (begin < t)]
     if len(overshot):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
-        again = State.of_spans(begin[overshot], span[1, overshot], *(limit[overshot] for limit in limits))
-        states[:, overshot] = torch.stack(again._replace(looks=state.looks[overshot]))
-        march(evaluator.exact, lines, states, overshot, LOOKS)
-    return _result(pixels, number, state, radius, evaluator.evaluations), occupancy
+        again = State.of_spans(begin[overshot], far[overshot], *(limit[overshot] for limit in limits))
+        states[:, overshot] = torch.stack(again)
+        looked += march(evaluator.exact, lines, states, overshot, ALONE)
+    looks = evaluations(looked, len(number))
+    trace = _result(pixels, number, State(*states.unbind(0)), far, looks, radius)
+    return replace(trace, setup_evaluations=evaluator.evaluations - int(trace.evaluations.sum())), occupancy
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
@@ -127,13 +129,21 @@ def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[In
     return number[some], span[:, some]
 
 
-def _result(pixels: Pixels, number: Int[Tensor, "n"], state: State, radius: float, evaluations: int) -> Trace:
+def _result(
+    pixels: Pixels,
+    number: Int[Tensor, "n"],
+    state: State,
+    far: Float[Tensor, "n"],
+    looks: Int[Tensor, "n"],
+    radius: float,
+) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
-    outcome = (state.at <= state.far) * int(Outcome.HIT)  # or ESCAPED, which is 0
+    at = state.root.minimum(state.end + state.bracket)
+    outcome = (at < far) * int(Outcome.HIT)  # or ESCAPED, which is 0
     outcome = outcome.masked_fill(state.value >= NEVER, int(Outcome.INSIDE))
-    outcome = outcome.masked_fill(state.done == 0, int(Outcome.EXHAUSTED))
+    outcome = outcome.masked_fill(state.going > 0, int(Outcome.EXHAUSTED))
     hit = outcome == int(Outcome.HIT)
-    found = [torch.where(hit, state.at, torch.inf), torch.where(hit, state.at, state.closest), outcome, state.looks]
+    found = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, looks]
     near, far = pixels.lines.in_sphere()
     beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
@@ -143,4 +153,4 @@ def _result(pixels: Pixels, number: Int[Tensor, "n"], state: State, radius: floa
     lengths, counts = pixels.image(table).split(2)
     distance, closest = lengths.unbind(0)
     outcome, looks = counts.long().unbind(0)
-    return Trace(distance, outcome, closest, closest, looks, setup_evaluations=evaluations - int(looks.sum()))
+    return Trace(distance, outcome, closest, closest, looks)
