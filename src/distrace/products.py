@@ -56,8 +56,6 @@ class Product(NamedTuple):
     def ended(self, units: Tensor, points: Tensor, shape: Tensor | None) -> Float[Tensor, "n"]:
         """The one output of a last layer."""
         outputs, (x, weight) = self._begun(units, points, shape, None)
-        if outputs.dim() == 1 and len(x):  # of no points it makes one
-            return torch.addmv(outputs, x, weight[:, 0])
         return torch.addmm(outputs, x, weight)[:, 0]
 
     def _begun(

@@ -12,7 +12,7 @@ from distrace.tracing.images import Lines
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 NEVER = 1e3  # radii: farther than any place on a ray
 # In how many places at once a ray is looked at, look by look; what becomes of it does not hang on other rays.
-ROUGH = (1, 1, 1, 2, 3)  # by rough values …
+ROUGH = (1, 1, 1, 2, 3)  # by rough values, as often as cones are looked at …
 NEAR = (1, 1, 4, 8, 16, 32, *[64] * 42)  # … and by exact ones after these: rays that graze the surface take many
 ALONE = (*[1] * 4, 2, 2, 4, 4, 8, 8, 16, 16, *[32] * 36)  # by exact ones where there are no rough ones
 Looked = tuple[Int[Tensor, "_"], int]

@@ -96,6 +96,7 @@ def _traced(
     limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(config.tolerance)]
     limits = [lines.of_view(each).expand_as(t) for each in [*limits, BRACKET * limits[1]]]
     states = torch.stack(State.of_spans(t, far, *limits))
+    setup = evaluator.evaluations
     left = every = torch.arange(len(number), device=number.device)
     looked: list[Looked] = [(every[:0], 0)]
     if evaluator.error:
@@ -109,7 +110,7 @@ def _traced(
         looked += march(evaluator.exact, lines, states, overshot, ALONE)
     looks = evaluations(looked, len(number))
     trace = _result(pixels, number, State(*states.unbind(0)), far, looks, radius)
-    return replace(trace, setup_evaluations=evaluator.evaluations - int(trace.evaluations.sum())), occupancy
+    return replace(trace, setup_evaluations=setup), occupancy
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
