@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from distrace.checkpoint import load_model
 from distrace.evaluation import growth
 from distrace.evaluation.bench import poster_view, reference_distance
 from distrace.evaluation.tables import growth_page
@@ -43,6 +44,13 @@ def test_views_share_one_occupancy() -> None:
     one, three = growth.by_views(sphere(0.5), 1)
     assert three.visible > 2.9 * one.visible
     assert three.queries < 3 * one.queries
+
+
+def test_many_shapes_in_one_call_cost_little_more_than_their_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(growth, "SHAPES", (2,))
+    whole, evaluations = growth.by_shapes(load_model("sofas"), 3)
+    assert whole.queries == evaluations.queries > 2 * growth.poster_view(64).width
+    assert 0.3 * whole.seconds < evaluations.seconds < 1.1 * whole.seconds
 
 
 @pytest.mark.parametrize(("layers", "width"), [(4, 128), (8, 256)])

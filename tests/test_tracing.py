@@ -392,8 +392,8 @@ def test_the_posters_view_takes_few_calls_of_the_field(counts) -> None:
 
 
 def test_the_posters_view_takes_few_operations(counts) -> None:
-    assert counts[512]["operations"] <= 1600
-    assert counts[512]["next"] <= 1400
+    assert counts[512]["operations"] <= 1400
+    assert counts[512]["next"] <= 1200
 
 
 def test_operations_grow_no_faster_than_the_logarithm_of_the_images_side(counts) -> None:

@@ -121,7 +121,8 @@ class Camera(ByValue):
         directions = (rotation * (ahead / depth_one[..., None])[..., None, :]).sum(-1)
         origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
         focal = self.intrinsics[..., 0, 0].reshape(*batch, *axes)
-        return Rays(origins, directions), depth_one.reciprocal(), (depth_one.square() * focal).reciprocal()
+        cosines = depth_one.reciprocal()
+        return Rays(origins, directions), cosines, cosines.square() / focal
 
     def project(self, points_world: Float[Tensor, "*points 3"]) -> tuple[Tensor, Tensor]:
         """Pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""

@@ -202,7 +202,7 @@ def render(
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive, finite radius")
     rays, cosines, angle = camera.sight()
     if isinstance(config, TracerConfig):
-        trace, occupancy = trace_images(sdf, camera, radius, config, occupancy)
+        trace, occupancy = trace_images(sdf, camera, rays, radius, config, occupancy)
     elif isinstance(sdf, BatchField):
         raise ValueError(f"a field of {len(sdf)} shapes was given with {config}; only the default tracer takes several")
     else:

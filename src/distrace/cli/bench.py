@@ -34,9 +34,9 @@ class Bench:
 
     what: tyro.conf.Positional[Literal["trace", "fields", "growth", "memory", "gradients", "solvers", "views"]]
     """trace: every strategy on the poster's view; fields: on fields that break what sphere tracing assumes; growth:
-    with the size of the image, of the network and the number of views; memory: beyond the weights, up to 4096 pixels;
-    gradients: exact and DIST's against finite differences, and the time of a backward pass; solvers: how fast Adam and
-    Levenberg–Marquardt complete the held-out shapes; views: whether random views of models are right"""
+    with the size of the image, of the network and the numbers of views and shapes; memory: beyond the weights, up to
+    4096 pixels; gradients: exact and DIST's against finite differences, and the time of a backward pass; solvers: how
+    fast Adam and Levenberg–Marquardt complete the held-out shapes; views: whether random views of models are right"""
     models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]"), tyro.conf.Positional] = ()
     """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, by default all
     bundled ones"""
@@ -99,6 +99,7 @@ class Bench:
             growth.by_size(field, self.repeats),
             growth.by_network(self.repeats),
             growth.by_views(field, self.repeats),
+            growth.by_shapes(model, self.repeats),
         )
         with progress("growth", growth.COUNT) as bar, torch.no_grad():
             for axis in axes:

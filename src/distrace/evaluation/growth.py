@@ -1,28 +1,31 @@
-"""How the default tracer's cost grows with the sizes of image and network, and with the number of views."""
+"""How the default tracer's cost grows with the sizes of image and network, and with the numbers of views and shapes."""
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from distrace.camera import Camera
-from distrace.checkpoint import load_model
+from distrace.checkpoint import Model, load_model
 from distrace.decoder import Decoder, NetworkSpecs
 from distrace.evaluation.bench import in_turn, poster_view
 from distrace.field import SDF
 from distrace.movie import turntable
 from distrace.render import STRATEGIES, Buffers, render
+from distrace.tracing.evaluator import Evaluator
 
 BOTH = ("fast", "coarse_to_fine")
 MEASURED = (1024, 2048, 4096)  # pixels along each side, for which memory is measured
 SIZES = (64, 128, 256, 512, 1024, 2048)  # pixels along each side
 NETWORKS = ((4, 128), (4, 256), (8, 256), (8, 512))  # layers × width
 VIEWS = (1, 2, 4, 8, 16)
-COUNT = 23  # of rows
+SHAPES = (1, 8, 32)
+COUNT = 29  # of rows
 RADIUS = 0.6  # of the shape of untrained networks
 
 
@@ -58,6 +61,43 @@ def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
     for count in VIEWS:
         cameras = turntable(poster_view(256), count) if count > 1 else [poster_view(256)]
         yield from _rows("views", f"{count}", sdf, cameras, BOTH[:1], repeats)
+
+
+def by_shapes(model: Model, repeats: int) -> Iterator[GrowthRow]:
+    """Several shapes in one call, at 64 × 64 pixels each; and the evaluations of that call, alone."""
+    for count in (count for count in SHAPES if count <= len(model.codes)):
+        field, one = model.field(model.codes[:count]), poster_view(64).to(model.codes.device)
+        pose, intrinsics = (each.expand(count, -1, -1) for each in (one.T_world_camera, one.intrinsics))
+        camera = replace(one, T_world_camera=pose, intrinsics=intrinsics)
+        with recorded() as calls:
+            buffers = render(field, camera)
+        runs = {"fast": partial(render, field, camera), "its evaluations": partial(_again, list(calls), buffers)}
+        visible, queries = int(buffers.mask.sum()), buffers.trace.total_evaluations
+        for name, (_, seconds, times) in in_turn(runs, repeats).items():
+            yield GrowthRow("shapes", f"{count}", name, visible, queries, queries / max(visible, 1), seconds, times)
+
+
+@contextmanager
+def recorded() -> Iterator[list[Callable[[], Tensor]]]:
+    """What the tracer evaluates meanwhile, to be evaluated once more."""
+    calls: list[Callable[[], Tensor]] = []
+    at = Evaluator.at
+
+    def watched(self: Evaluator, points: Tensor, shape: Tensor | None, *, rough: bool = False) -> Tensor:
+        calls.append(partial(at, self, points, shape, rough=rough))
+        return calls[-1]()
+
+    Evaluator.at = watched
+    try:
+        yield calls
+    finally:
+        Evaluator.at = at
+
+
+def _again(calls: list[Callable[[], Tensor]], buffers: Buffers) -> Buffers:
+    for call in calls:
+        call()
+    return buffers
 
 
 def ball(layers: int, width: int) -> SDF:

@@ -87,7 +87,9 @@ def growth_page(rows: Sequence[GrowthRow]) -> str:
     for axis in dict.fromkeys(row.axis for row in rows):
         some = [row for row in rows if row.axis == axis]
         parts.append(section(axis.capitalize(), table(*_cells(some)), *(_charts(some) if axis != "network" else ())))
-    return page("How the cost grows", "The poster's view; 256 × 256 pixels where views or networks are counted.", parts)
+    return page(
+        "How the cost grows", "The poster's view; 256 × 256 pixels for views and networks, 64 × 64 for shapes.", parts
+    )
 
 
 def gradients_page(rows: Sequence[RatioRow], ratios: Sequence[np.ndarray], timings: Sequence[Timing]) -> str:

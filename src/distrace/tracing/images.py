@@ -7,7 +7,7 @@ from functools import cached_property
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.nn.functional import normalize
+from torch.nn.functional import pad
 
 from distrace.camera import Camera
 from distrace.rays import Rays, meet_sphere
@@ -66,11 +66,14 @@ class Pixels:
     level: int = 0  # the largest blocks have BRANCH ** level pixels a side
 
     @staticmethod
-    def of_camera(camera: Camera, radius: float, largest: float) -> "Pixels":
-        """Of an image or a batch of them; in the middle of the sphere the cones of blocks stay within `largest`."""
+    def of_camera(camera: Camera, rays: Rays, radius: float, largest: float) -> "Pixels":
+        """Of an image or a batch of them; in the middle of the sphere the cones of blocks stay within `largest`.
+
+        The last rows and columns are repeated in the padding: no farther from the middle of their blocks than others.
+        """
         pose = camera.T_world_camera.detach().reshape(-1, 4, 4)
         inverse = torch.linalg.inv(camera.intrinsics.detach().reshape(-1, 3, 3))
-        eye, rotation = pose[:, :3, 3] / radius, pose[:, :3, :3]
+        eye = pose[:, :3, 3] / radius
         shift = (eye.norm(dim=1) - 1).clamp_min(0)
         growth = inverse[:, :2, :2].norm(dim=1).amax(1)
         width = growth * shift
@@ -80,9 +83,8 @@ class Pixels:
             level += 1
         views, side = len(eye), BRANCH**level
         rows, columns = (-(-size // side) * side for size in (camera.height, camera.width))
-        x, y = (torch.arange(0.5, size, dtype=eye.dtype, device=eye.device) for size in (columns, rows))
-        right, down, ahead = (rotation @ inverse).reshape(-1, 1, 1, 3, 3).unbind(-1)
-        directions = normalize(right * x[:, None] + (down * y.reshape(-1, 1, 1) + ahead), dim=-1)
+        directions = rays.directions.detach().reshape(1, views, camera.height, camera.width, 3)
+        directions = pad(directions, (0, 0, 0, columns - camera.width, 0, rows - camera.height), mode="replicate")[0]
         origins = torch.addcmul(eye.reshape(-1, 1, 1, 3), shift.reshape(-1, 1, 1, 1), directions)
         view = None if views == 1 else torch.arange(views, device=eye.device).repeat_interleave(rows * columns)
         lines = Lines.of(origins.reshape(-1, 3), directions.reshape(-1, 3), view)
@@ -96,12 +98,17 @@ class Pixels:
         lines, zero, count = Lines.of(rays.at(start), rays.directions, None), start.new_zeros(1), len(start)
         return Pixels(lines, start, zero, zero, zero + torch.inf, (1, 1, count), (count,))
 
+    @cached_property
+    def span(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+        """From where to where each ray is in the sphere."""
+        return self.lines.in_sphere()
+
     def blocks(self) -> Int[Tensor, "n"]:
         """The middle rays of all of the largest blocks."""
         views, rows, columns = self.shape
-        side, device = BRANCH**self.level, self.width.device
-        row, column = (torch.arange(side // 2, size, side, device=device) for size in (views * rows, columns))
-        return (row[:, None] * columns + column).reshape(-1)
+        side = BRANCH**self.level
+        number = torch.arange(views * rows * columns, device=self.width.device).reshape(-1, columns)
+        return number[side // 2 :: side, side // 2 :: side].reshape(-1)
 
     def split(self, blocks: Int[Tensor, "n"], side: int) -> Int[Tensor, "m"]:
         """The middle rays of the nine parts of each block, nine after nine; `side` is that of the parts, in pixels."""

@@ -15,11 +15,10 @@ from distrace.trace import Outcome, Trace
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
-from distrace.tracing.march import ALONE, NEAR, NEVER, ROUGH, Looked, State, evaluations, march, march_cones
+from distrace.tracing.march import ALONE, BRACKET, NEAR, ROUGH, Looked, State, evaluations, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
 GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
-BRACKET = 2.0  # tolerances: in a shorter bracket the root of the line is taken
 FINE = 0.02  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
@@ -44,11 +43,12 @@ class TracerConfig:
 def trace_images(
     sdf: SDF | BatchField,
     camera: Camera,
+    rays: Rays,
     radius: float = 1.0,
     config: TracerConfig = TracerConfig(),
     occupancy: Occupancy | None = None,
 ) -> tuple[Trace, Occupancy]:
-    """Traces all pixels of a camera, or of a batch of them; the occupancy serves further views of the same field.
+    """Traces the rays of a camera, or of a batch of them; the occupancy serves further views of the same field.
 
     Raises `ValueError` for an occupancy of another radius, number of shapes or Lipschitz constant, and for another
     number of cameras than of shapes.
@@ -56,7 +56,7 @@ def trace_images(
     views = camera.intrinsics.shape[:-2].numel()
     if isinstance(sdf, BatchField) and len(sdf) != views:
         raise ValueError(f"a field of {len(sdf)} shapes and {views} cameras were given; give a camera for each shape")
-    pixels = Pixels.of_camera(camera, radius, LARGEST)
+    pixels = Pixels.of_camera(camera, rays, radius, LARGEST)
     return _traced(sdf, pixels, radius, config, occupancy)
 
 
@@ -79,6 +79,14 @@ def _traced(
     else:
         _check(occupancy, evaluator, config.lipschitz)
     evaluator.normalise(occupancy.lipschitz)
+    number, span = _spans(evaluator, occupancy, pixels)
+    setup = evaluator.evaluations
+    state, looks = _marched(evaluator, pixels, config.tolerance, number, span)
+    return replace(_result(pixels, number, state, span[1], looks, radius), setup_evaluations=setup), occupancy
+
+
+def _spans(evaluator: Evaluator, occupancy: Occupancy, pixels: Pixels) -> tuple[Int[Tensor, "n"], Float[Tensor, "3 n"]]:
+    """The rays that may meet surface; from where and up to where, and from where if f is steeper than its bound."""
     number = pixels.blocks()
     span = occupancy.entered(pixels.lines[number])
     for level in range(pixels.level, 0, -1):
@@ -86,31 +94,34 @@ def _traced(
         lines, cone = pixels.lines[number], reach(BRANCH**level)
         width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
         wide = torch.addcmul(width, growth, span[1])
-        span = march_cones(evaluator.rough, lines, span, wide, len(ROUGH), evaluator.error)
+        span = march_cones(evaluator.rough, lines, span, wide, evaluator.error)
         number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
-    near, far = pixels.lines[number].in_sphere()
-    begin = span[2].maximum(near)
-    number, span = _not_empty(number, torch.stack([span[0].maximum(near), span[1].minimum(far), begin]))
-    lines = pixels.lines[number]
+    t, last, begin = span.unbind(0)
+    near, far = (each[number] for each in pixels.span)
+    return _not_empty(number, torch.stack([t.maximum(near), last.minimum(far), begin.maximum(near)]))
+
+
+def _marched(
+    evaluator: Evaluator, pixels: Pixels, tolerance: float, number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]
+) -> tuple[State, Int[Tensor, "n"]]:
+    """What becomes of these rays, and how often f was evaluated for each."""
     t, far, begin = span.unbind(0)
-    limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(config.tolerance)]
-    limits = [lines.of_view(each).expand_as(t) for each in [*limits, BRACKET * limits[1]]]
-    states = torch.stack(State.of_spans(t, far, *limits))
-    setup = evaluator.evaluations
-    left = every = torch.arange(len(number), device=number.device)
-    looked: list[Looked] = [(every[:0], 0)]
+    lines, every = pixels.lines[number], torch.arange(len(number), device=number.device)
+    limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(tolerance)]
+    gap, tolerances = (lines.of_view(each).expand_as(t) for each in limits)
+    state = State.begun(evaluator.rough, lines, t, far, gap, tolerances)
+    states, clear = torch.stack(state), state.value > evaluator.error
+    looked: list[Looked] = [(every, 1)]
     if evaluator.error:
-        looked += march(evaluator.rough, lines, states, every, ROUGH, evaluator.error)
-        left = every[states[0] < far]
+        looked += march(evaluator.rough, lines, states, every[clear], ROUGH, evaluator.error)
+    again = every[~clear]
+    if len(again):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
+        limits = (each[again] for each in (begin, far, gap, tolerances))
+        states[:, again] = torch.stack(State.begun(evaluator.exact, lines[again], *limits))
+        looked.append((again, 1))
+    left = every[(states[0] < far) & (states[1] > 0)]
     looked += march(evaluator.exact, lines, states, left, NEAR if evaluator.error else ALONE)
-    overshot = every[(states[1] >= NEVER) & (begin < t)]
-    if len(overshot):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
-        again = State.of_spans(begin[overshot], far[overshot], *(limit[overshot] for limit in limits))
-        states[:, overshot] = torch.stack(again)
-        looked += march(evaluator.exact, lines, states, overshot, ALONE)
-    looks = evaluations(looked, len(number))
-    trace = _result(pixels, number, State(*states.unbind(0)), far, looks, radius)
-    return replace(trace, setup_evaluations=setup), occupancy
+    return State(*states.unbind(0)), evaluations(looked, len(number))
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
@@ -126,7 +137,8 @@ def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) 
 
 def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Without the rays of which nothing is left."""
-    some = span[0] < span[1]
+    t, end, _ = span.unbind(0)
+    some = t < end
     return number[some], span[:, some]
 
 
@@ -139,13 +151,14 @@ def _result(
     radius: float,
 ) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
-    at = state.root.minimum(state.end + state.bracket)
+    at = state.root.minimum(torch.add(state.end, state.tolerance, alpha=BRACKET + 1))
     outcome = (at < far) * int(Outcome.HIT)  # or ESCAPED, which is 0
-    outcome = outcome.masked_fill(state.value >= NEVER, int(Outcome.INSIDE))
-    outcome = outcome.masked_fill(state.going > 0, int(Outcome.EXHAUSTED))
+    left = state.t < state.end
+    outcome = outcome.masked_fill(left, int(Outcome.EXHAUSTED))
+    outcome = outcome.masked_fill(left & (state.value <= 0), int(Outcome.INSIDE))
     hit = outcome == int(Outcome.HIT)
     found = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, looks]
-    near, far = pixels.lines.in_sphere()
+    near, far = pixels.span
     beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
     table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
