@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 import torch
 from torch.func import functional_call
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace.decoder import Decoder, NetworkSpecs, ShapeField
+from distrace.evaluation.bench import Operations
 from distrace.field import chunked
 
 torch.set_num_threads(1)
@@ -335,16 +335,6 @@ def test_points_for_another_number_of_shapes_are_refused(points):
         field.select(torch.tensor([0, 3, -1]))
     with pytest.raises(ValueError, match=r"^points in torch.float32 were given to a decoder in torch.float64"):
         field.select(torch.tensor([0, 1]))(points[:2].float())
-
-
-class Operations(TorchDispatchMode):
-    """Counts what PyTorch dispatches."""
-
-    count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += 1
-        return func(*args, **(kwargs or {}))
 
 
 @pytest.mark.parametrize(("select", "most"), [(False, 24), (True, 28)])

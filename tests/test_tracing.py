@@ -7,13 +7,12 @@ import pytest
 import torch
 from bumpy import bumpy_balls
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace import primitives
 from distrace.camera import Camera
 from distrace.checkpoint import load_model
 from distrace.errors import DoubtfulResult
-from distrace.evaluation.bench import poster_view, reference_distance
+from distrace.evaluation.bench import Operations, poster_view, reference_distance
 from distrace.field import SDF, Counted
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render
@@ -341,18 +340,6 @@ def test_a_smaller_tolerance_is_kept() -> None:
         buffers = render(P.torus(0.5, 0.2), camera, config=TracerConfig(tolerance=tolerance))
         errors.append((buffers.distance - true)[buffers.mask & true.isfinite()].abs().max())
     assert errors[1] < 1e-6 < errors[0]
-
-
-class Operations(TorchDispatchMode):
-    """Counts what PyTorch is asked to do."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += 1
-        return func(*args, **(kwargs or {}))
 
 
 def counts_of(sdf: SDF, camera: Camera) -> Counter[str]:

@@ -8,6 +8,7 @@ from statistics import median
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace.camera import Camera
 from distrace.field import SDF
@@ -50,6 +51,18 @@ class Case:
     render: Callable[[], Buffers]
     truth: Float[Tensor, "*batch"]
     share: float = 1.0  # of all rays that enter the sphere
+
+
+class Operations(TorchDispatchMode):
+    """Counts what PyTorch is asked to do."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = 0
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count += 1
+        return func(*args, **(kwargs or {}))
 
 
 def poster_view(size: int = 512) -> Camera:

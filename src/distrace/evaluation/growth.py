@@ -10,10 +10,11 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from distrace.batch_field import BatchField
 from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.evaluation.bench import in_turn, poster_view
+from distrace.evaluation.bench import Operations, in_turn, poster_view
 from distrace.field import SDF
 from distrace.movie import turntable
 from distrace.render import STRATEGIES, Buffers, render
@@ -27,6 +28,7 @@ VIEWS = (1, 2, 4, 8, 16)
 SHAPES = (1, 8, 32)
 COUNT = 29  # of rows
 RADIUS = 0.6  # of the shape of untrained networks
+Runs = dict[str, Callable[[], list[Buffers]]]
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,7 @@ class GrowthRow:
     visible: int
     queries: int
     per_pixel: float
+    operations: int  # of PyTorch
     seconds: float
     runs: int
 
@@ -47,20 +50,21 @@ def by_size(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
     """Fast and coarse-to-fine on the poster's view; the latter up to 512 pixels, where it takes most of a minute."""
     for size in SIZES:
         strategies = BOTH if size <= 512 else BOTH[:1]
-        yield from _rows("pixels", f"{size}", sdf, [poster_view(size)], strategies, repeats)
+        yield from _rows("pixels", f"{size}", _in_a_row(sdf, [poster_view(size)], strategies), repeats)
 
 
 def by_network(repeats: int) -> Iterator[GrowthRow]:
     """Untrained networks whose surface is about a sphere."""
     for layers, width in NETWORKS:
-        yield from _rows("network", f"{layers} × {width}", ball(layers, width), [poster_view(256)], BOTH, repeats)
+        runs = _in_a_row(ball(layers, width), [poster_view(256)], BOTH)
+        yield from _rows("network", f"{layers} × {width}", runs, repeats)
 
 
 def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
     """Views around a shape, each with the occupancy of the first."""
     for count in VIEWS:
         cameras = turntable(poster_view(256), count) if count > 1 else [poster_view(256)]
-        yield from _rows("views", f"{count}", sdf, cameras, BOTH[:1], repeats)
+        yield from _rows("views", f"{count}", _in_a_row(sdf, cameras, BOTH[:1]), repeats)
 
 
 def by_shapes(model: Model, repeats: int) -> Iterator[GrowthRow]:
@@ -71,10 +75,8 @@ def by_shapes(model: Model, repeats: int) -> Iterator[GrowthRow]:
         camera = replace(one, T_world_camera=pose, intrinsics=intrinsics)
         with recorded() as calls:
             buffers = render(field, camera)
-        runs = {"fast": partial(render, field, camera), "its evaluations": partial(_again, list(calls), buffers)}
-        visible, queries = int(buffers.mask.sum()), buffers.trace.total_evaluations
-        for name, (_, seconds, times) in in_turn(runs, repeats).items():
-            yield GrowthRow("shapes", f"{count}", name, visible, queries, queries / max(visible, 1), seconds, times)
+        runs = _in_a_row(field, [camera], BOTH[:1]) | {"its evaluations": partial(_again, calls, [buffers])}
+        yield from _rows("shapes", f"{count}", runs, repeats)
 
 
 @contextmanager
@@ -94,10 +96,10 @@ def recorded() -> Iterator[list[Callable[[], Tensor]]]:
         Evaluator.at = at
 
 
-def _again(calls: list[Callable[[], Tensor]], buffers: Buffers) -> Buffers:
+def _again(calls: list[Callable[[], Tensor]], views: list[Buffers]) -> list[Buffers]:
     for call in calls:
         call()
-    return buffers
+    return views
 
 
 def ball(layers: int, width: int) -> SDF:
@@ -120,23 +122,34 @@ def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
     return decoder.requires_grad_(False)
 
 
-def _rows(
-    axis: str, value: str, sdf: SDF, cameras: list[Camera], strategies: tuple[str, ...], repeats: int
-) -> Iterator[GrowthRow]:
-    counted: dict[str, tuple[int, int]] = {}
+def _in_a_row(sdf: SDF | BatchField, cameras: list[Camera], strategies: tuple[str, ...]) -> Runs:
+    """The views of one shape by each strategy; later ones have the occupancy of the first."""
 
-    def run(strategy: str) -> Buffers:
+    def run(strategy: str) -> list[Buffers]:
         views, occupancy = [], None
         for camera in cameras:
             views.append(render(sdf, camera, config=STRATEGIES[strategy], occupancy=occupancy))
             occupancy = views[-1].occupancy
-        counted[strategy] = sum(int(v.mask.sum()) for v in views), sum(v.trace.total_evaluations for v in views)
+        return views
+
+    return {strategy: partial(run, strategy) for strategy in strategies}
+
+
+def _rows(axis: str, value: str, runs: Runs, repeats: int) -> Iterator[GrowthRow]:
+    counted: dict[str, tuple[int, int, int]] = {}
+
+    def run(name: str) -> Buffers:
+        if name in counted:
+            return runs[name]()[-1]
+        with Operations() as operations:  # in the first run alone: counting takes time
+            views = runs[name]()
+        visible = sum(int(view.mask.sum()) for view in views)
+        counted[name] = visible, sum(view.trace.total_evaluations for view in views), operations.count
         return views[-1]
 
-    results = in_turn({name: partial(run, name) for name in strategies}, repeats)
-    for name, (_, seconds, runs) in results.items():
-        visible, queries = counted[name]
-        yield GrowthRow(axis, value, name, visible, queries, queries / max(visible, 1), seconds, runs)
+    for name, (_, seconds, times) in in_turn({name: partial(run, name) for name in runs}, repeats).items():
+        visible, queries, operations = counted[name]
+        yield GrowthRow(axis, value, name, visible, queries, queries / max(visible, 1), operations, seconds, times)
 
 
 def peak_memory(model: str, code: int, size: int) -> float:
