@@ -18,7 +18,7 @@ from distrace.products import Layer, Product, evaluated, joined, linear
 QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
 ROUND = 16  # widths that processors like
 SAMPLED = 8  # deviations are measured at every so many points
-CPU_CHUNK = 1 << 16  # points evaluated at a time without derivatives …
+CPU_CHUNK = 1 << 17  # points evaluated at a time without derivatives …
 RECORDED_CHUNK = 4096  # … and with: a layer's fresh activations then stay in the cache
 GPU_CHUNK = 1 << 20
 FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond

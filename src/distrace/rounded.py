@@ -13,7 +13,7 @@ from distrace.field import SDF, flattened, in_chunks
 from distrace.products import Layer
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
-MANY = 1 << 16  # … unless it is one of so many
+MANY = 1 << 16  # … of fewer rows than these
 CHUNK = 1 << 17  # points at a time: a bound on memory
 
 
@@ -79,6 +79,6 @@ class Rounded:
 
 
 def filled(rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "m *_"]:
-    """With rows of zeros after them, up to a multiple of `ROWS`."""
+    """With rows of zeros after them, up to a multiple of `ROWS`, where they are not `MANY`."""
     missing = -len(rows) % ROWS if len(rows) < MANY else 0
     return pad(rows, (0, 0) * (rows.dim() - 1) + (0, missing)) if missing else rows

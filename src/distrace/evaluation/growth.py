@@ -33,7 +33,7 @@ Runs = dict[str, Callable[[], list[Buffers]]]
 
 @dataclass(frozen=True)
 class GrowthRow:
-    """What one image cost, or several views of one shape together. Times are medians, of runs in turn."""
+    """What one image cost, or several of one shape or of several together. Times are medians, of runs in turn."""
 
     axis: str
     value: str
@@ -123,7 +123,7 @@ def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
 
 
 def _in_a_row(sdf: SDF | BatchField, cameras: list[Camera], strategies: tuple[str, ...]) -> Runs:
-    """The views of one shape by each strategy; later ones have the occupancy of the first."""
+    """The views of a field by each strategy; later ones have the occupancy of the first."""
 
     def run(strategy: str) -> list[Buffers]:
         views, occupancy = [], None

@@ -110,8 +110,8 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
 def _mean_slope(
     blocks: Float[Tensor, "*batch 8"], corners: Float[Tensor, "8 3"], width: float
 ) -> Float[Tensor, "*batch"]:
-    """|∇f| over blocks of cells, by differences averaged over each axis: at most the steepest in them; 0 by NaN."""
-    return (blocks @ corners).norm(dim=-1).nan_to_num(0.0) / (4 * width)
+    """|∇f| over blocks of cells, by differences averaged over each axis; 0 where f is not finite."""
+    return (blocks @ corners).norm(dim=-1).nan_to_num(0.0, posinf=0.0) / (4 * width)
 
 
 def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step: float) -> Float[Tensor, "shapes"]:

@@ -39,6 +39,8 @@ class Evaluator:
         self, points: Float[Tensor, "*k n 3"], shape: Int[Tensor, "n"] | None, *, rough: bool = False
     ) -> Float[Tensor, "*k n"]:
         """Values at points of the unit sphere, each of the shape of its number."""
+        if not points.numel():
+            return points[..., 0]
         self.evaluations += points.numel() // 3
         field = self.cheap if rough and self.cheap is not None else self.sdf
         world = points if self.radius == 1 else points * self.radius

@@ -5,7 +5,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from distrace.tracing.images import Lines
@@ -30,9 +30,9 @@ class State(NamedTuple):
     value: Float[Tensor, "*k n"]  # of f at t
     at: Float[Tensor, "*k n"]  # where f is looked at next
     root: Float[Tensor, "*k n"]  # of the line through the last two values
-    least: Float[Tensor, "*k n"]  # f so far …
-    closest: Float[Tensor, "*k n"]  # … and where that was
     end: Float[Tensor, "n"]  # where the ray is done: beyond is no surface or, after a bracket, a point inside
+    least: Float[Tensor, "n"]  # f so far …
+    closest: Float[Tensor, "n"]  # … and where that was
     gap: Float[Tensor, "n"]  # half of what the balls around two samples may leave between them
     tolerance: Float[Tensor, "n"]  # how far off a hit may be
 
@@ -47,8 +47,8 @@ class State(NamedTuple):
     ) -> "State":
         """Of rays that are clear before t and after an end, once f was looked at there."""
         value = values(lines, t)
-        at = torch.minimum(t + value, end)
-        return State(t, value, at, at, value, t, end, gap, tolerance)
+        at = torch.minimum(t + value.maximum(tolerance), end)  # t may be on the surface
+        return State(t, value, at, at, end, value, t, gap, tolerance)
 
 
 PLACED = State._fields.index("end")  # of the facts, so many are of a place that was looked at …
@@ -100,31 +100,40 @@ def march(
     return looked
 
 
-def evaluations(looked: list[Looked], count: int) -> Int[Tensor, "n"]:
+def evaluations(looked: list[Looked], count: int) -> Shaped[Tensor, "n"]:
     """How often f was evaluated for each of so many rays."""
     rays = torch.cat([ray for ray, _ in looked])
     lengths, places = torch.tensor([(len(ray), places) for ray, places in looked], device=rays.device).unbind(1)
-    return rays.bincount(places.repeat_interleave(lengths), count).long()
+    return rays.bincount(places.repeat_interleave(lengths), count)
 
 
 def _looked(state: State, values: Values, lines: Lines, places: int, error: float | None) -> State:
     """Looks ahead in several places, as far apart as one would be, and tells what is known after the first to stop at.
 
-    They fill the rest of the ray evenly where that is short. A ray stops where f fell below half of what it was: the
-    line would have a root before the next place.
+    They fill the rest of the ray evenly where that is short; the last may lie half a step beyond its end. A ray stops
+    where f fell below half of what it was: the line would have a root before the next place.
     """
     if places == 1:
-        return _advanced(state, values(lines, state.at), error)[0]
-    spread = state.t.lerp(state.end, 1 / (places - 0.5))
-    first = state.at.minimum(spread).maximum(state.t + state.tolerance)
-    along = torch.lerp(state.t, first, _order(places, first.dtype, first.device))
-    at = along[1:]
-    after = values(lines, at)
-    before = torch.cat([state.value[None], after[:-1]])
-    found, clear, drop = _advanced(state._replace(t=along[:-1], value=before, at=at), after, error)
-    passed = (clear & (drop < after))[:-1].cumprod(0).sum(0)
-    ray = torch.arange(len(passed), device=passed.device)
-    return State(*torch.stack(found[:PLACED])[:, passed, ray].unbind(0), *found[PLACED:])
+        lowest = values(lines, state.at)
+        where = state.at
+        found, _, _ = _advanced(state, lowest, error)
+    else:
+        order = _order(places, state.t.dtype, state.t.device)
+        spread = state.t.lerp(state.end, 1 / (places - 0.5))
+        first = state.at.minimum(spread).maximum(state.t + state.tolerance)
+        along = torch.lerp(state.t, first, order)
+        at = along[1:]
+        after = values(lines, at)
+        before = torch.cat([state.value[None], after[:-1]])
+        found, clear, drop = _advanced(state._replace(t=along[:-1], value=before, at=at), after, error)
+        passed = (clear & (drop < after))[:-1].cumprod(0).sum(0)
+        ray = torch.arange(len(passed), device=passed.device)
+        placed = torch.stack(found[:PLACED])[:, passed, ray].unbind(0)
+        found = State(*placed, *found[PLACED:])
+        lowest, place = after.min(0)
+        where = at[place, ray]
+    closest = torch.where(lowest < state.least, where, state.closest)
+    return found._replace(least=torch.fmin(lowest, state.least), closest=closest)
 
 
 @lru_cache
@@ -143,9 +152,9 @@ def _advanced(
     half the gap; the end of the ray, or the middle of a step that did not count. A point where f is too small for the
     line's root to be far counts as the surface: the ray ends there, a bracket earlier.
     """
-    t, before, at, _, least, closest, end, gap, tolerance = state
+    t, before, at, _, end, *_, gap, tolerance = state
     step, drop = at - t, before - after
-    slope = torch.fmax(drop / step, FLAT)  # also where f is NaN
+    slope = torch.fmax(drop / step, FLAT)  # also where f is NaN, or the step zero
     uncovered = torch.sub(step - before, gap, alpha=2)  # what is left to the ball after
     if error is None:
         small = tolerance * slope * slope
@@ -158,6 +167,5 @@ def _advanced(
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
     limit = torch.where(after > uncovered, end, t.lerp(at, 0.5))
     following = torch.fmin(torch.fmin(root, balls), limit)
-    closest, least = torch.where(after < least, at, closest), torch.fmin(after, least)
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
-    return State(moved, value, following, root, least, closest, end, gap, tolerance), clear, drop
+    return state._replace(t=moved, value=value, at=following, root=root, end=end), clear, drop

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 from distrace.batch_field import BatchField
@@ -80,9 +80,9 @@ def _traced(
         _check(occupancy, evaluator, config.lipschitz)
     evaluator.normalise(occupancy.lipschitz)
     number, span = _spans(evaluator, occupancy, pixels)
-    setup = evaluator.evaluations
     state, looks = _marched(evaluator, pixels, config.tolerance, number, span)
-    return replace(_result(pixels, number, state, span[1], looks, radius), setup_evaluations=setup), occupancy
+    trace = _result(pixels, number, state, span[1], looks, radius)
+    return replace(trace, setup_evaluations=evaluator.evaluations - int(trace.evaluations.sum())), occupancy
 
 
 def _spans(evaluator: Evaluator, occupancy: Occupancy, pixels: Pixels) -> tuple[Int[Tensor, "n"], Float[Tensor, "3 n"]]:
@@ -103,7 +103,7 @@ def _spans(evaluator: Evaluator, occupancy: Occupancy, pixels: Pixels) -> tuple[
 
 def _marched(
     evaluator: Evaluator, pixels: Pixels, tolerance: float, number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]
-) -> tuple[State, Int[Tensor, "n"]]:
+) -> tuple[State, Shaped[Tensor, "n"]]:
     """What becomes of these rays, and how often f was evaluated for each."""
     t, far, begin = span.unbind(0)
     lines, every = pixels.lines[number], torch.arange(len(number), device=number.device)
@@ -114,13 +114,13 @@ def _marched(
     looked: list[Looked] = [(every, 1)]
     if evaluator.error:
         looked += march(evaluator.rough, lines, states, every[clear], ROUGH, evaluator.error)
-    again = every[~clear]
+    going, again = states[0] < far, every[~clear]
     if len(again):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
         limits = (each[again] for each in (begin, far, gap, tolerances))
         states[:, again] = torch.stack(State.begun(evaluator.exact, lines[again], *limits))
         looked.append((again, 1))
-    left = every[(states[0] < far) & (states[1] > 0)]
-    looked += march(evaluator.exact, lines, states, left, NEAR if evaluator.error else ALONE)
+        going = going & (states[1] > -tolerances)
+    looked += march(evaluator.exact, lines, states, every[going], NEAR if evaluator.error else ALONE)
     return State(*states.unbind(0)), evaluations(looked, len(number))
 
 
@@ -147,7 +147,7 @@ def _result(
     number: Int[Tensor, "n"],
     state: State,
     far: Float[Tensor, "n"],
-    looks: Int[Tensor, "n"],
+    looks: Shaped[Tensor, "n"],
     radius: float,
 ) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
@@ -164,7 +164,5 @@ def _result(
     table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
     table.index_copy_(1, number, torch.stack([each.to(near.dtype) for each in found]))
     table[:2].add_(pixels.start).mul_(radius)
-    lengths, counts = pixels.image(table).split(2)
-    distance, closest = lengths.unbind(0)
-    outcome, looks = counts.long().unbind(0)
-    return Trace(distance, outcome, closest, closest, looks)
+    distance, closest, outcome, looks = pixels.image(table).unbind(0)
+    return Trace(distance, outcome.long(), closest, closest, looks.long())
