@@ -3,7 +3,6 @@
 import math
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from photographed import EXACT
@@ -147,11 +146,9 @@ def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
 def test_from_the_outline_alone_most_cameras_twenty_degrees_off_are_found() -> None:
     """Of 64 pixels: it tells no more than a degree, and some starts end where another outline is nearly the same."""
     observed = view(dtype=torch.float32)
-    ends = [
-        found(only(observed, "mask"), turned(observed.camera, degrees)) for degrees in np.arange(16, 22, 0.5).tolist()
-    ]
+    ends = [found(only(observed, "mask"), turned(observed.camera, degrees)) for degrees in (18, 19, 20, 21, 22)]
     errors = [pose_error(end, observed.camera) for end in ends]
-    assert sum(degrees < 1 and percent < 1 for degrees, percent in errors) >= 7
+    assert sum(degrees < 1 and percent < 1 for degrees, percent in errors) >= 3
 
 
 def test_from_normals_alone_the_orientation_is_found() -> None:

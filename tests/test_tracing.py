@@ -13,11 +13,12 @@ from distrace.camera import Camera
 from distrace.checkpoint import load_model
 from distrace.errors import DoubtfulResult
 from distrace.evaluation.bench import Operations, poster_view, reference_distance
+from distrace.evaluation.growth import recorded
 from distrace.field import SDF, Counted
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render
 from distrace.trace import Outcome
-from distrace.tracing.evaluator import Evaluator, cheaper
+from distrace.tracing.evaluator import cheaper
 from distrace.tracing.tracer import TracerConfig, trace_rays
 
 f64 = torch.float64
@@ -345,16 +346,9 @@ def test_a_smaller_tolerance_is_kept() -> None:
 def counts_of(sdf: SDF, camera: Camera) -> Counter[str]:
     """Operations of a first rendering and of the next; calls of the field and evaluations of the first."""
     counts: Counter[str] = Counter()
-    at = Evaluator.at
-
-    def counted(self: Evaluator, points: Tensor, *args, **named) -> Tensor:
-        counts["calls"] += 1
-        counts["points"] += points.numel() // 3
-        return at(self, points, *args, **named)
-
-    with pytest.MonkeyPatch.context() as patch, torch.no_grad(), Operations() as operations:
-        patch.setattr(Evaluator, "at", counted)
+    with recorded() as calls, torch.no_grad(), Operations() as operations:
         first = render(sdf, camera)
+    counts["calls"], counts["points"] = len(calls), sum(call.args[1].numel() // 3 for call in calls)
     trace, counts["operations"] = first.trace, operations.count
     with torch.no_grad(), Operations() as operations:
         render(sdf, camera, occupancy=first.occupancy)

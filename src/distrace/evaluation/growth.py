@@ -80,9 +80,9 @@ def by_shapes(model: Model, repeats: int) -> Iterator[GrowthRow]:
 
 
 @contextmanager
-def recorded() -> Iterator[list[Callable[[], Tensor]]]:
+def recorded() -> Iterator[list[partial[Tensor]]]:
     """What the tracer evaluates meanwhile, to be evaluated once more."""
-    calls: list[Callable[[], Tensor]] = []
+    calls: list[partial[Tensor]] = []
     at = Evaluator.at
 
     def watched(self: Evaluator, points: Tensor, shape: Tensor | None, *, rough: bool = False) -> Tensor:
@@ -96,7 +96,7 @@ def recorded() -> Iterator[list[Callable[[], Tensor]]]:
         Evaluator.at = at
 
 
-def _again(calls: list[Callable[[], Tensor]], views: list[Buffers]) -> list[Buffers]:
+def _again(calls: list[partial[Tensor]], views: list[Buffers]) -> list[Buffers]:
     for call in calls:
         call()
     return views
