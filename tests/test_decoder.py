@@ -127,7 +127,7 @@ def test_more_points_than_a_chunk_are_as_good_as_few(monkeypatch, points):
     decoder = randomised(PLAIN)
     code = a_code(decoder)
     whole = decoder.field(code)(points)
-    monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+    monkeypatch.setattr("distrace.decoder.CHUNK", 7)
     monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
     torch.testing.assert_close(decoder.field(code)(points), whole)
     with torch.no_grad():
@@ -318,7 +318,7 @@ def test_chunks_of_a_selection_change_nothing(monkeypatch, points, recorded):
     field = decoder.field(a_code(decoder, 3)).select(a_selection(len(points), 3))
     with torch.set_grad_enabled(recorded):
         whole = field(points)
-        monkeypatch.setattr("distrace.decoder.CPU_CHUNK", 7)
+        monkeypatch.setattr("distrace.decoder.CHUNK", 7)
         monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
         torch.testing.assert_close(field(points), whole)
 

@@ -18,9 +18,8 @@ from distrace.products import Layer, Product, evaluated, joined, linear
 QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
 ROUND = 16  # widths that processors like
 SAMPLED = 8  # deviations are measured at every so many points
-CPU_CHUNK = 1 << 17  # points evaluated at a time without derivatives …
-RECORDED_CHUNK = 4096  # … and with: a layer's fresh activations then stay in the cache
-GPU_CHUNK = 1 << 20
+CHUNK = 1 << 20  # points evaluated at a time without derivatives, and with …
+RECORDED_CHUNK = 4096  # … on a CPU: a layer's fresh activations then stay in the cache
 FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond
 
 
@@ -167,7 +166,7 @@ class Evaluation:
         on_cpu = weight.device.type == "cpu"
         quick = on_cpu and not torch.is_grad_enabled() and not self.decoder.has_layer_norms
         quick = quick and not self.decoder.training and not torch._C._are_functorch_transforms_active()
-        size = (CPU_CHUNK if quick else RECORDED_CHUNK) if on_cpu else GPU_CHUNK
+        size = RECORDED_CHUNK if on_cpu and not quick else CHUNK
         return in_chunks(self._quick if quick else self._recorded, size, points, *([] if shape is None else [shape]))
 
     def _quick(self, points: Tensor, shape: Tensor | None = None) -> Tensor:

@@ -13,7 +13,8 @@ Layer = tuple[Tensor, Tensor]
 """Weight [outputs, inputs], and bias [outputs] or, one for each shape or point, [..., outputs]."""
 
 LINEAR_RELU = torch.ops.aten._addmm_activation  # one operation, and on a GPU one kernel
-_spare: list[Tensor] = []  # at most one buffer, 537 MB for 131,072 points of an 8 × 512 decoder in float32
+KEPT = 1 << 27  # numbers in a buffer that later calls use again: 537 MB, 131,072 points of an 8 × 512 decoder
+_spare: list[Tensor] = []  # at most one buffer
 
 
 def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
@@ -109,5 +110,5 @@ def _buffer(like: Tensor, size: int) -> Iterator[Float[Tensor, "_"]]:
     try:
         yield buffer
     finally:
-        if not _spare:
+        if not _spare and len(buffer) <= KEPT:
             _spare.append(buffer)

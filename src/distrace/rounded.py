@@ -8,13 +8,12 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from distrace.batch_field import BatchField
-from distrace.decoder import Decoder
+from distrace.decoder import CHUNK, Decoder
 from distrace.field import SDF, flattened, in_chunks
 from distrace.products import Layer
 
 ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
 MANY = 1 << 16  # … of fewer rows than these
-CHUNK = 1 << 17  # points at a time: a bound on memory
 
 
 class Rounded:
