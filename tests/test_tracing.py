@@ -391,6 +391,42 @@ def test_a_surface_on_the_sphere_is_hit(radius: float) -> None:
     assert (buffers.mask == met).float().mean() > 0.99
 
 
+def beside_the_middle(distance: Tensor) -> Rays:
+    """Rays along −z that pass the origin at these distances."""
+    zero = torch.zeros_like(distance)
+    origins = torch.stack([distance, zero, zero + 3], dim=1)
+    return Rays(origins, torch.tensor([0.0, 0.0, -1.0], dtype=distance.dtype).expand_as(origins))
+
+
+def test_a_surface_just_out_of_the_sphere_is_hit_where_rays_enter() -> None:
+    """f rises along rays that graze such a surface: its line has no root ahead."""
+    trace, _ = trace_rays(P.sphere(1.00003), beside_the_middle(torch.linspace(0.9, 1, 2001)))
+    assert trace.hit.any()
+    assert trace.distance[trace.hit].min() > 2
+    assert trace.distance[trace.hit].max() < 3.01
+
+
+@pytest.mark.parametrize("shape", [P.sphere(0.5), P.box(torch.tensor([0.5, 0.3, 0.2], dtype=f64))])
+def test_what_a_ray_passes_by_less_than_the_tolerance_is_not_hit(shape: SDF) -> None:
+    beside = torch.logspace(-6, -4, 100, dtype=f64)  # of a tolerance of 2.5e-4
+    trace, _ = trace_rays(shape, beside_the_middle(0.5 + beside))
+    assert not trace.hit.any()
+    trace, _ = trace_rays(shape, beside_the_middle(0.5 - beside))
+    assert trace.hit[beside > 5e-5].all()
+
+
+def test_no_rays_at_all_hit_nothing() -> None:
+    trace, _ = trace_rays(SOFA, beside_the_middle(torch.zeros(0)))
+    assert trace.distance.shape == trace.hit.shape == (0,)
+
+
+def test_a_view_in_double_precision_takes_the_occupancy_of_one_in_single() -> None:
+    single, double = (view(24, dtype=dtype) for dtype in (torch.float32, f64))
+    occupancy = render(P.sphere(0.5), single).occupancy
+    clearance = render(P.sphere(0.5), double, occupancy=occupancy).clearance
+    torch.testing.assert_close(clearance, render(P.sphere(0.5), double).clearance, rtol=0, atol=1e-3)
+
+
 def test_an_infinite_value_far_from_the_surface_changes_nothing() -> None:
     ball, camera = primitives.sphere(0.5), view(32)
     with torch.no_grad():

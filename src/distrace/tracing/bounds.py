@@ -55,7 +55,7 @@ class Occupancy:
     @torch.no_grad()
     def lowest(self, rays: Rays, bounds: Bounds, shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
         """Where along rays of the world the value between the coarse cells' centres is least."""
-        volume = self.values.reshape(1, 1, -1, CELLS, CELLS)  # all shapes in a row
+        volume = self.values.to(bounds.near.dtype).reshape(1, 1, -1, CELLS, CELLS)  # all shapes in a row
         last = volume.new_tensor(volume.shape[2:]) - 1
         before = F.pad(shape[:, None] * CELLS, (0, 2))
         best, least = bounds.near, torch.full_like(bounds.near, torch.inf)

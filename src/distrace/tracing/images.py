@@ -107,7 +107,7 @@ class Pixels:
         """The middle rays of all of the largest blocks."""
         views, rows, columns = self.shape
         side = BRANCH**self.level
-        number = torch.arange(views * rows * columns, device=self.width.device).reshape(-1, columns)
+        number = torch.arange(views * rows * columns, device=self.width.device).reshape(views * rows, columns)
         return number[side // 2 :: side, side // 2 :: side].reshape(-1)
 
     def split(self, blocks: Int[Tensor, "n"], side: int) -> Int[Tensor, "m"]:
@@ -118,10 +118,10 @@ class Pixels:
 
     def image(self, each: Float[Tensor, "k n"]) -> Float[Tensor, "k *size"]:
         """What is known of each ray, without the padding."""
-        whole = each.reshape(-1, *self.shape)
+        whole = each.reshape(len(each), *self.shape)
         if len(self.size) > 1:
             whole = whole[..., : self.size[-2], : self.size[-1]]
-        return whole.reshape(-1, *self.size)
+        return whole.reshape(len(each), *self.size)
 
 
 def reach(side: int) -> float:

@@ -15,9 +15,10 @@ Schedule = tuple[tuple[int, ...], ...]
 """In how many places at once rays are looked at, look by look; after each group those that are done are left out."""
 CONES = 5  # looks at the cones of a size
 ROUGH: Schedule = ((1, 1), (2, 3))  # of single rays by rough values …
-NEAR: Schedule = ((1,), (1,), (4,), (8,), (16,), (32,), *[(64,)] * 42)  # … and by exact ones after these: some graze
-ALONE: Schedule = (*[(1,)] * 4, *[(2,)] * 2, *[(4,)] * 2, *[(8,)] * 2, *[(16,)] * 2, *[(32,)] * 36)  # by these alone
+NEAR: Schedule = ((1,), (1,), (4,), (8,), (16,), (32,), *[(256,)] * 42)  # … and by exact ones after these: some graze
+ALONE: Schedule = (*[(1,)] * 4, *[(2,)] * 2, *[(4,)] * 2, (8,), (16,), (32,), *[(256,)] * 37)  # by these alone
 BRACKET = 2  # tolerances: in a shorter bracket the root of the line is taken
+BEHIND = 0.1  # tolerances that a look aims behind a root: a ray ends at what is inside, not at what is near
 FLAT = torch.tensor(1e-6)  # no slope is less, so that lines have a root
 Looked = tuple[Int[Tensor, "_"], int]
 """Rays that were looked at together, and in how many places each."""
@@ -149,23 +150,24 @@ def _advanced(
 
     A step counts if the balls around its ends leave no more than the gap between them. The next one ends at the nearest
     of these: the root of the line through the last two values; where the balls around its ends, by the slope, leave
-    half the gap; the end of the ray, or the middle of a step that did not count. A point where f is too small for the
-    line's root to be far counts as the surface: the ray ends there, a bracket earlier.
+    half the gap; the end of the ray, or the middle of a step that did not count. The ray ends a bracket before a point
+    inside; it goes on to one that is, by the slope, within the tolerance of the surface.
     """
     t, before, at, _, end, *_, gap, tolerance = state
     step, drop = at - t, before - after
     slope = torch.fmax(drop / step, FLAT)  # also where f is NaN, or the step zero
     uncovered = torch.sub(step - before, gap, alpha=2)  # what is left to the ball after
+    covered = after > uncovered
     if error is None:
-        small = tolerance * slope * slope
-        clear = after > uncovered.maximum(-small)
-        end = torch.where(after < small, torch.sub(at, tolerance, alpha=BRACKET), end)
+        clear = covered & (torch.addcmul(after, tolerance, slope) > 0)
+        end = torch.where(after < 0, torch.sub(at, tolerance, alpha=BRACKET), end)
         end = end.amin(0) if after.dim() > 1 else end
     else:
         clear = after > uncovered.clamp_min(error)
     root = torch.addcdiv(at, after, slope)
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
-    limit = torch.where(after > uncovered, end, t.lerp(at, 0.5))
-    following = torch.fmin(torch.fmin(root, balls), limit)
+    limit = torch.where(covered, end, t.lerp(at, 0.5))
+    inside = torch.add(root, tolerance, alpha=BEHIND)
+    following = torch.fmin(torch.fmin(inside, balls), limit)
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
     return state._replace(t=moved, value=value, at=following, root=root, end=end), clear, drop

@@ -18,8 +18,8 @@ from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import ALONE, BRACKET, NEAR, ROUGH, Looked, State, evaluations, march, march_cones
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
-GAP = 0.006  # radii of a ray, and two pixels, at most, that the balls around its samples may leave unchecked
-FINE = 0.02  # pixels: the tolerance of a hit, where that is less than a configuration's
+GAP = 0.003  # radii of a ray, and half a pixel, at most, that the balls around its samples may leave unchecked
+FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ def _marched(
     """What becomes of these rays, and how often f was evaluated for each."""
     t, far, begin = span.unbind(0)
     lines, every = pixels.lines[number], torch.arange(len(number), device=number.device)
-    limits = [pixels.middle.clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(tolerance)]
+    limits = [(pixels.middle / 4).clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(tolerance)]
     gap, tolerances = (lines.of_view(each).expand_as(t) for each in limits)
     state = State.begun(evaluator.rough, lines, t, far, gap, tolerances)
     states, clear = torch.stack(state), state.value > evaluator.error
@@ -151,7 +151,7 @@ def _result(
     radius: float,
 ) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
-    at = state.root.minimum(torch.add(state.end, state.tolerance, alpha=BRACKET + 1))
+    at = state.root.clamp(state.t - state.tolerance, torch.add(state.end, state.tolerance, alpha=BRACKET + 1))
     outcome = (at < far) * int(Outcome.HIT)  # or ESCAPED, which is 0
     left = state.t < state.end
     outcome = outcome.masked_fill(left, int(Outcome.EXHAUSTED))
