@@ -96,9 +96,9 @@ class Bench:
     def _growth(self, run: Run, model: Model) -> None:
         field, rows = model.field(self.code), []
         axes = (
-            growth.by_size(field, self.repeats),
-            growth.by_network(self.repeats),
-            growth.by_views(field, self.repeats),
+            growth.by_size(field, self.repeats, run.device),
+            growth.by_network(self.repeats, run.device),
+            growth.by_views(field, self.repeats, run.device),
             growth.by_shapes(model, self.repeats),
         )
         with progress("growth", growth.COUNT) as bar, torch.no_grad():

@@ -29,6 +29,7 @@ SHAPES = (1, 8, 32)
 COUNT = 29  # of rows
 RADIUS = 0.6  # of the shape of untrained networks
 Runs = dict[str, Callable[[], list[Buffers]]]
+Device = torch.device | str
 
 
 @dataclass(frozen=True)
@@ -46,24 +47,25 @@ class GrowthRow:
     runs: int
 
 
-def by_size(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
+def by_size(sdf: SDF, repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
     """Fast and coarse-to-fine on the poster's view; the latter up to 512 pixels, where it takes most of a minute."""
     for size in SIZES:
         strategies = BOTH if size <= 512 else BOTH[:1]
-        yield from _rows("pixels", f"{size}", _in_a_row(sdf, [poster_view(size)], strategies), repeats)
+        yield from _rows("pixels", f"{size}", _in_a_row(sdf, [poster_view(size).to(device)], strategies), repeats)
 
 
-def by_network(repeats: int) -> Iterator[GrowthRow]:
+def by_network(repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
     """Untrained networks whose surface is about a sphere."""
     for layers, width in NETWORKS:
-        runs = _in_a_row(ball(layers, width), [poster_view(256)], BOTH)
+        runs = _in_a_row(ball(layers, width, device), [poster_view(256).to(device)], BOTH)
         yield from _rows("network", f"{layers} × {width}", runs, repeats)
 
 
-def by_views(sdf: SDF, repeats: int) -> Iterator[GrowthRow]:
+def by_views(sdf: SDF, repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
     """Views around a shape, each with the occupancy of the first."""
     for count in VIEWS:
-        cameras = turntable(poster_view(256), count) if count > 1 else [poster_view(256)]
+        view = poster_view(256).to(device)
+        cameras = turntable(view, count) if count > 1 else [view]
         yield from _rows("views", f"{count}", _in_a_row(sdf, cameras, BOTH[:1]), repeats)
 
 
@@ -102,10 +104,10 @@ def _again(calls: list[partial[Tensor]], views: list[Buffers]) -> list[Buffers]:
     return views
 
 
-def ball(layers: int, width: int) -> SDF:
+def ball(layers: int, width: int, device: Device = "cpu") -> SDF:
     """The field of a network before any training."""
     specs = NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=())
-    return ball_decoder(specs, RADIUS).field(torch.zeros(1))
+    return ball_decoder(specs, RADIUS).to(device).field(torch.zeros(1, device=device))
 
 
 def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
