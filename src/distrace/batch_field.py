@@ -45,7 +45,7 @@ class BatchField(Generic[Single]):
             given, takes = list(points.shape), [len(self), "...", 3]
             raise ValueError(f"points of shape {given} were given to a field of {len(self)} shapes; give {takes}")
         shape = torch.arange(len(self), device=points.device)
-        return self._values(points, shape.reshape(-1, *[1] * (points.dim() - 2)))
+        return self.values(points, shape.reshape(-1, *[1] * (points.dim() - 2)))
 
     def select(self, shape: Int[Tensor, "n"]) -> "Selection":
         """The field of points [..., n, 3], of which those at index k of the last batch axis belong to shape `shape[k]`.
@@ -55,9 +55,10 @@ class BatchField(Generic[Single]):
         if len(shape) and not 0 <= int(shape.min()) <= int(shape.max()) < len(self):
             given = f"{int(shape.min())} to {int(shape.max())}"
             raise ValueError(f"shapes {given} were selected; there are {len(self)}, counted from 0")
-        return Selection(self._values, shape)
+        return Selection(self.values, shape)
 
-    def _values(self, points: Float[Tensor, "*batch 3"], shape: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+    def values(self, points: Float[Tensor, "*batch 3"], shape: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+        """Values at points, each of the shape of its number."""
         each = shape if points.dim() == 2 else shape.expand(points.shape[:-1]).reshape(-1)
         return flattened(lambda flat: self.evaluate(flat, each), points)
 
@@ -88,7 +89,13 @@ class CountedBatch(BatchField[Single]):
         super().__init__(field.codes, field.evaluate, field.single)
         self.evaluations = [0] * len(field)
 
-    def _values(self, points: Float[Tensor, "*batch 3"], shape: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
+    def values(self, points: Float[Tensor, "*batch 3"], shape: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
         counts = torch.bincount(shape.expand(points.shape[:-1]).reshape(-1), minlength=len(self)).tolist()
-        self.evaluations = [before + count for before, count in zip(self.evaluations, counts, strict=True)]
-        return super()._values(points, shape)
+        self.evaluations[:] = [before + count for before, count in zip(self.evaluations, counts, strict=True)]
+        return super().values(points, shape)
+
+    def counting(self, field: BatchField) -> "CountedBatch":
+        """Another form of the same fields, which counts here, too."""
+        counted = CountedBatch(field)
+        counted.evaluations = self.evaluations
+        return counted

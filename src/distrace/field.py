@@ -8,7 +8,10 @@ from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
 SDF = Callable[[Float[Tensor, "*batch 3"]], Float[Tensor, "*batch"]]
-"""Signed distance at points of the unit sphere: positive outside, negative inside, the surface where it is zero."""
+"""Signed distance at points: positive outside, negative inside, the surface where it is zero; finite everywhere.
+
+The default tracer asks for values up to 1.7 radii from the middle of its sphere.
+"""
 
 
 def asked(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:

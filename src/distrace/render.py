@@ -167,7 +167,7 @@ class Buffers:
             missed = missed & ~excluded
         rays = self.rays[missed]
         bounds = meet_sphere(rays.detach(), self.radius)
-        options = {} if self.occupancy is None else {"reach": BESIDE * self.radius, "refine": 2}
+        options = {} if self.occupancy is None else {"reach": BESIDE * self.radius, "refine": 3}
         found = surface.clearance(self.field_at(missed), rays, closest[missed], bounds, **options)
         return least.masked_scatter(missed, found)
 
@@ -194,9 +194,9 @@ def render(
     are relative to it. Pass `occupancy=buffers.occupancy` to render another view of the same field without measuring
     the field again.
 
-    Warns `DoubtfulResult` where more than 0.1 % of the rays end without an answer, where the field gives NaN, and where
-    all rays start inside. Raises `ValueError` for a radius that is not positive and finite, for a field that does not
-    give one distance for each point, and for another number of cameras than of shapes.
+    Warns `DoubtfulResult` where more than 0.1 % of the rays end without an answer, as they do where the field is NaN,
+    and where as many start inside. Raises `ValueError` for a radius that is not positive and finite, for a field that
+    does not give one distance for each point, and for another number of cameras than of shapes.
     """
     if not 0 < radius < math.inf:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive, finite radius")
@@ -233,10 +233,10 @@ def _warn(trace: Trace) -> None:
             DoubtfulResult,
             stacklevel=3,
         )
-    elif inside == met:
+    elif inside > DOUBTFUL * met:
         warnings.warn(
-            f"all {met} rays start inside the solid; is the camera in it, or the field's sign inverted (it is positive"
-            " outside)?",
+            f"{inside} of {met} rays start inside the solid: is the camera in it, the solid larger than `radius`, the"
+            " field's sign inverted (it is positive outside), or the field steeper than its Lipschitz constant?",
             DoubtfulResult,
             stacklevel=3,
         )

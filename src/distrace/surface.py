@@ -14,7 +14,8 @@ from distrace.rays import Bounds, Rays
 
 LEAST_SLOPE = 1e-6  # a ray along the surface has no derivative of its distance
 PART = 1 << 17  # points whose graph is kept: at 8 × 512 about 2 GiB
-WALK = 20  # rounds downhill: across the unit sphere at a `reach` of 0.1
+BESIDE = 2.0  # × what the last round looked to both sides: the corner is between
+WALK = 40  # rounds downhill: across the unit sphere at a `reach` of 0.05; a crooked corner takes 20 between the others
 
 
 def attach(
@@ -137,7 +138,7 @@ def least(
         value = sdf(rays.at(lowest))
     if not (_moves(rays) or _differentiable(sdf, rays.detach().at(lowest))):
         return value
-    beside = reach / 5 ** (_rounds(lowest, refine) - 1)  # where the last round looked: the corner is between
+    beside = BESIDE * reach / 5 ** (_rounds(lowest, refine) - 1)
     steps = beside * torch.tensor([-1.0, 1.0]).to(lowest).reshape(2, *[1] * lowest.dim())
     both = Rays(rays.origins.expand(2, *rays.origins.shape), rays.directions.expand(2, *rays.directions.shape))
     values = sdf(both.at(lowest + steps))
@@ -179,8 +180,9 @@ def minimum_and_value(
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
     """The distance of that minimum, and f there: 1 + 3 · refine evaluations and more.
 
-    Each round looks `reach` to both sides and moves to the parabola's vertex. Where that lies within, it looks a fifth
-    as far from then on; where it does not (a coarse start may have passed the minimum) it goes on downhill.
+    Each round looks to both sides, at first as far as `reach`, and moves to the parabola's vertex. Where that lies
+    within, it looks a fifth as far from then on; where it does not (a coarse start may have passed the minimum, and a
+    corner is no parabola) it goes on downhill.
     """
     flat, t = rays.flat(), closest.reshape(-1).clone()
     near = torch.zeros_like(t) if bounds is None else bounds.near.reshape(-1)

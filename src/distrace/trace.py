@@ -18,7 +18,7 @@ class Outcome(IntEnum):
     """What became of a ray."""
 
     ESCAPED = 0  # left the bounds, or never met them
-    HIT = 1  # |sdf| fell below the tolerance
+    HIT = 1  # the surface is within the tolerance
     EXHAUSTED = 2  # neither, within the steps; or the field gave NaN
     INSIDE = 3  # starts in the solid
 
@@ -69,7 +69,7 @@ class Trace(ByValue):
     closest: Float[Tensor, "*batch"]  # the distance at which |sdf| was least
     stopped: Float[Tensor, "*batch"]  # where the march stood when it ended, whatever the outcome
     evaluations: Int[Tensor, "*batch"]  # of the field, for this ray
-    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels; an octree and blocks of pixels
+    setup_evaluations: int = 0  # of the field, for no single ray: coarse levels; cells and blocks of pixels
 
     @property
     def hit(self) -> Bool[Tensor, "*batch"]:

@@ -14,7 +14,7 @@ from distrace.field import SDF
 from distrace.pixels import thinned
 from distrace.render import Buffers
 
-MOST = 64  # hits
+MOST = 256  # hits
 CHORDS = 10  # steps are longer than those of the other rows
 ACROSS = 1 / 20  # of the footprint's width: a step to either side, one pixel in all where footprints are ten wide
 WITHIN = 1 / 400  # the same where the field itself changes: over longer steps not even its distances are linear

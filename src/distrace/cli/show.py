@@ -58,7 +58,7 @@ class Render:
     sensor_mm: float = 32.0
     size: int = 512  # pixels along each side
     strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine", "fast"] = "fast"
-    """fast: octree, cones of pixel blocks, single rays in lock step; the others are DIST's strategies"""
+    """fast: cells, cones of pixel blocks, single rays in lock step; the others are DIST's strategies"""
     steps: int | None = None  # at most, of every strategy but fast; as the strategy has it, if not given
     clearance: Flag = False  # also the field's least value on each ray that misses, which costs evaluations
     device: str = "cpu"

@@ -21,7 +21,7 @@ from distrace.field import SDF, placed
 SATURATIONS = (1, 10, 15, 30)  # k of tanh(k f)
 WIDTHS = (1, 2, 3)  # pixels
 THICKEST = 0.4
-TINY = (1e-3, 1e-2)  # radii, far below the cells of the default tracer's octree
+TINY = (1e-3, 1e-2)  # radii, far below the cells of the default tracer
 OF_DECODER = ("decoder × 2", "clamped")
 HARD = ("decoder × 2", "thin plate", "high frequencies", "gap of a pixel", "clamped")
 

@@ -1,4 +1,4 @@
-"""Where a surface can be: an octree of cell centres, each of which excludes a ball by a Lipschitz constant of f."""
+"""Where a surface can be: centres of cells on two levels exclude balls, by a Lipschitz constant of f."""
 
 import itertools
 from dataclasses import dataclass
@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
+from torch.nn.functional import normalize
 
 from distrace.batch_field import BatchField
 from distrace.field import SDF
@@ -21,6 +22,10 @@ MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies be
 SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
 STEEP = 0.97  # share of these gradients that the bound covers: ReLU networks have a few steep facets
+FLAT = (
+    0.01  # of the steepest gradient: what is flatter is saturated; and of values, that a gradient is worth per radius
+)
+BAND = 0.018  # radii: a field that is flat wherever it was measured may rise to that within so much of its surface
 
 
 @dataclass(frozen=True)
@@ -31,7 +36,6 @@ class Occupancy:
     lipschitz: Float[Tensor, "shapes"]  # the bound on |∇f|: no less than that by which the others were excluded
     values: Float[Tensor, "shapes m m m"]  # of f at the centres of the coarser cells, in radii
     radius: float
-    evaluations: int
     cheap: SDF | BatchField | None = None  # the field by rougher products, where those are faster on this machine
 
     def entered(self, lines: Lines) -> Float[Tensor, "3 n"]:
@@ -91,8 +95,7 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     else:
         bound = like.new_full((shapes,), lipschitz)
     reach = (width * HALF_DIAGONAL * bound).reshape(-1, 1, 1, 1)
-    excluded = coarse > reach  # where the field gives NaN nothing is …
-    uncertain = ~(coarse.abs() > reach)  # … and nothing is known
+    uncertain = ~(coarse.abs() > reach)  # also where the field gives NaN
     shape, cell = uncertain.flatten(1).nonzero().unbind(1)
     children = centres[cell][:, None] + width / 4 * corners
     whose = shape.repeat_interleave(8)
@@ -100,11 +103,12 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     if lipschitz is None:
         bound = bound.scatter_reduce(0, shape, MARGIN * _mean_slope(fine.reshape(-1, 8), corners, width / 2), "amax")
         bound = bound.clamp_min(torch.finfo(bound.dtype).eps)  # of a constant field
+    excluded = coarse > width * HALF_DIAGONAL * bound.reshape(-1, 1, 1, 1)
     occupied = F.interpolate((~excluded).to(like.dtype)[:, None], scale_factor=2.0)[:, 0]
     x, y, z = ((children + 1) * CELLS).long().reshape(-1, 3).unbind(1)
     occupied[whose, x, y, z] = (~(fine > width / 2 * HALF_DIAGONAL * bound[whose])).to(like.dtype)
     beside = F.max_pool3d(occupied[:, None], 3, 1, 1)[:, 0] > 0
-    return Occupancy(beside, bound, coarse, evaluator.radius, evaluator.evaluations, evaluator.cheap)
+    return Occupancy(beside, bound, coarse, evaluator.radius)
 
 
 def _mean_slope(
@@ -115,10 +119,27 @@ def _mean_slope(
 
 
 def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step: float) -> Float[Tensor, "shapes"]:
-    """What most |∇f| stay below in the cells nearest to the surface, by differences over a short `step`."""
-    shapes = len(values)
-    nearest = centres[values.abs().topk(PROBES, largest=False).indices]
-    offsets = step * torch.eye(4, 3, dtype=centres.dtype, device=centres.device)  # the last is none
-    whose = torch.arange(shapes, device=centres.device).repeat_interleave(4 * PROBES)
-    around = evaluator.at((nearest[:, :, None] + offsets).reshape(-1, 3), whose).reshape(shapes, PROBES, 4)
-    return ((around[..., :3] - around[..., 3:]) / step).norm(dim=-1).kthvalue(int(STEEP * PROBES), dim=1).values
+    """What most |∇f| stay below near the surface, by differences over a short `step`.
+
+    They are measured in the cells nearest to the surface, and once more a Newton step on, as far as a cell's corner:
+    what saturates, like tanh(s f), is steep at its surface alone. Of a field that is flat in all of these cells nothing
+    is known but that it may be truncated: then its band is taken to be `BAND` wide.
+    """
+    values, nearest = values.abs().topk(PROBES, largest=False)
+    at = centres[nearest]
+    first = _gradient(evaluator, at, step)
+    length = first.norm(dim=-1)
+    way = (values / length).clamp_max(2 / CELLS * HALF_DIAGONAL).nan_to_num(0.0)
+    at = at - normalize(first, dim=-1) * way[..., None]
+    steep = torch.cat([length, _gradient(evaluator, at, step).norm(dim=-1)], dim=1).nan_to_num(0.0)
+    steepest, least = steep.amax(1, keepdim=True), values[:, 0]
+    found = steep.masked_fill(steep < FLAT * steepest, torch.nan).nanquantile(STEEP, dim=1)
+    return torch.where(steepest[:, 0] > FLAT * least, found, least / BAND)
+
+
+def _gradient(evaluator: Evaluator, points: Float[Tensor, "shapes n 3"], step: float) -> Float[Tensor, "shapes n 3"]:
+    shapes, count, _ = points.shape
+    offsets = step * torch.eye(4, 3, dtype=points.dtype, device=points.device)  # the last is none
+    whose = torch.arange(shapes, device=points.device).repeat_interleave(4 * count)
+    around = evaluator.at((points[:, :, None] + offsets).reshape(-1, 3), whose).reshape(shapes, count, 4)
+    return (around[..., :3] - around[..., 3:]) / step

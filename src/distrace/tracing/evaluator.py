@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from distrace.batch_field import BatchField
+from distrace.batch_field import BatchField, CountedBatch
 from distrace.decoder import ShapeField
 from distrace.field import SDF, Counted, asked
 from distrace.quickest import quickest
@@ -23,7 +23,7 @@ class Evaluator:
     def __init__(self, sdf: SDF | BatchField, radius: float, cheap: SDF | BatchField | None = None) -> None:
         self.sdf, self.radius = sdf, radius
         self.shapes = len(sdf) if isinstance(sdf, BatchField) else 1
-        self.cheap = cheap
+        self.cheap = _counting(sdf, cheap)
         self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
         self.scale: Tensor | None = None  # [shapes]
         self.evaluations = 0
@@ -45,9 +45,7 @@ class Evaluator:
         field = self.cheap if rough and self.cheap is not None else self.sdf
         world = points if self.radius == 1 else points * self.radius
         if isinstance(field, BatchField):
-            each = torch.zeros_like(points[..., 0], dtype=torch.int64) if shape is None else shape
-            each = each.expand(points.shape[:-1]).reshape(-1)
-            values = field.evaluate(world.reshape(-1, 3), each).reshape(points.shape[:-1])
+            values = field.values(world, points.new_zeros(1, dtype=torch.int64) if shape is None else shape)
         else:
             values = asked(field, world)
         if self.scale is None:
@@ -63,11 +61,19 @@ class Evaluator:
 def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
     """A decoder's field in bfloat16 products, where those are faster on this machine; else none."""
     if isinstance(sdf, Counted):
-        cheap = cheaper(sdf.sdf)
-        return None if cheap is None else sdf.counting(cheap)
+        return cheaper(sdf.sdf)
     code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
     decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
     if decoder is None or code is None:
         return None
     quick = quickest(decoder)
     return None if quick is decoder else quick.field(code.detach())
+
+
+def _counting(sdf: SDF | BatchField, cheap: SDF | BatchField | None) -> SDF | BatchField | None:
+    """Counts what is evaluated roughly where exact values are counted."""
+    if isinstance(sdf, CountedBatch) and isinstance(cheap, BatchField):
+        return sdf.counting(cheap)
+    if isinstance(sdf, Counted) and cheap is not None and not isinstance(cheap, BatchField):
+        return sdf.counting(cheap)
+    return cheap

@@ -71,19 +71,20 @@ class Pixels:
 
         The last rows and columns are repeated in the padding: no farther from the middle of their blocks than others.
         """
-        pose = camera.T_world_camera.detach().reshape(-1, 4, 4)
-        inverse = torch.linalg.inv(camera.intrinsics.detach().reshape(-1, 3, 3))
+        pose = camera.T_world_camera.reshape(-1, 4, 4)
+        inverse = torch.linalg.inv(camera.intrinsics.reshape(-1, 3, 3))
         eye = pose[:, :3, 3] / radius
         shift = (eye.norm(dim=1) - 1).clamp_min(0)
-        growth = inverse[:, :2, :2].norm(dim=1).amax(1)
+        growth = torch.linalg.matrix_norm(inverse[:, :2, :2], 2)
         width = growth * shift
         middle, level = width + growth, 0
         pixel = float(middle.max())
-        while reach(BRANCH ** (level + 1)) * pixel < largest and BRANCH**level < max(camera.height, camera.width):
+        least = min(camera.height, camera.width)
+        while reach(BRANCH ** (level + 1)) * pixel < largest and BRANCH ** (level + 1) <= least:
             level += 1
         views, side = len(eye), BRANCH**level
         rows, columns = (-(-size // side) * side for size in (camera.height, camera.width))
-        directions = rays.directions.detach().reshape(1, views, camera.height, camera.width, 3)
+        directions = rays.directions.reshape(1, views, camera.height, camera.width, 3)
         directions = pad(directions, (0, 0, 0, columns - camera.width, 0, rows - camera.height), mode="replicate")[0]
         origins = torch.addcmul(eye.reshape(-1, 1, 1, 3), shift.reshape(-1, 1, 1, 1), directions)
         view = None if views == 1 else torch.arange(views, device=eye.device).repeat_interleave(rows * columns)

@@ -131,7 +131,7 @@ def _looked(state: State, values: Values, lines: Lines, places: int, error: floa
         ray = torch.arange(len(passed), device=passed.device)
         placed = torch.stack(found[:PLACED])[:, passed, ray].unbind(0)
         found = State(*placed, *found[PLACED:])
-        lowest, place = after.min(0)
+        lowest, place = after.masked_fill(at > state.end, torch.inf).min(0)
         where = at[place, ray]
     closest = torch.where(lowest < state.least, where, state.closest)
     return found._replace(least=torch.fmin(lowest, state.least), closest=closest)

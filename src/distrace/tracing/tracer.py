@@ -19,6 +19,7 @@ from distrace.tracing.march import ALONE, BRACKET, NEAR, ROUGH, Looked, State, e
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
 GAP = 0.003  # radii of a ray, and half a pixel, at most, that the balls around its samples may leave unchecked
+FINEST = 16  # × what numbers can tell of 1: no tolerance is less, in radii
 FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
 
 
@@ -65,7 +66,8 @@ def trace_rays(
     sdf: SDF, rays: Rays, radius: float = 1.0, config: TracerConfig = TracerConfig(), occupancy: Occupancy | None = None
 ) -> tuple[Trace, Occupancy]:
     """The same for rays [n] that are no image: each is marched on its own. Raises `ValueError` as `trace_images`."""
-    rays = rays.detach()
+    if isinstance(sdf, BatchField):
+        raise ValueError(f"a field of {len(sdf)} shapes was given with rays; give one of them, as `field[0]`")
     pixels = Pixels.of_rays(Rays(rays.origins / radius, rays.directions))
     return _traced(sdf, pixels, radius, config, occupancy)
 
@@ -73,9 +75,10 @@ def trace_rays(
 def _traced(
     sdf: SDF | BatchField, pixels: Pixels, radius: float, config: TracerConfig, occupancy: Occupancy | None
 ) -> tuple[Trace, Occupancy]:
-    evaluator = Evaluator(sdf, radius, cheaper(sdf) if occupancy is None else occupancy.cheap)
+    cheap = cheaper(sdf) if occupancy is None else occupancy.cheap
+    evaluator = Evaluator(sdf, radius, cheap)
     if occupancy is None:
-        occupancy = find_occupancy(evaluator, pixels.width, config.lipschitz)
+        occupancy = replace(find_occupancy(evaluator, pixels.width, config.lipschitz), cheap=cheap)
     else:
         _check(occupancy, evaluator, config.lipschitz)
     evaluator.normalise(occupancy.lipschitz)
@@ -107,7 +110,8 @@ def _marched(
     """What becomes of these rays, and how often f was evaluated for each."""
     t, far, begin = span.unbind(0)
     lines, every = pixels.lines[number], torch.arange(len(number), device=number.device)
-    limits = [(pixels.middle / 4).clamp_max(GAP / 2), (FINE * pixels.middle).clamp_max(tolerance)]
+    finest = FINEST * torch.finfo(t.dtype).eps
+    limits = [(pixels.middle / 4).clamp(finest, GAP / 2), (FINE * pixels.middle).clamp(finest, max(tolerance, finest))]
     gap, tolerances = (lines.of_view(each).expand_as(t) for each in limits)
     state = State.begun(evaluator.rough, lines, t, far, gap, tolerances)
     states, clear = torch.stack(state), state.value > evaluator.error
