@@ -29,7 +29,9 @@ P = primitives
 SOFA = P.union(P.box(torch.tensor([0.6, 0.15, 0.3])), P.box(torch.tensor([0.15, 0.5, 0.3])))
 
 
-def view(size: int = 48, azimuth: float = 30.0, elevation: float = 20.0, distance: float = 4.97, **more) -> Camera:
+def view(
+    size: int = 48, azimuth: float | Tensor = 30.0, elevation: float = 20.0, distance: float = 4.97, **more
+) -> Camera:
     return Camera.orbit(azimuth, elevation, distance, height=size, width=size, **more)
 
 
@@ -486,6 +488,20 @@ def test_evaluations_of_several_shapes_are_counted_for_each() -> None:
         trace = render(counted, batch).trace
     assert sum(counted.evaluations) == trace.total_evaluations
     assert min(counted.evaluations) > 1000
+
+
+@pytest.mark.parametrize("again", [False, True])
+def test_a_batch_of_one_shape_gives_its_image(again: bool) -> None:
+    model = load_model("sofas")
+    batch = view(32, azimuth=torch.tensor([30.0]))
+    with torch.no_grad():
+        one = render(model.field(0), view(32))
+        several = render(model.field(model.codes[:1]), batch)
+        if again:
+            several = render(model.field(model.codes[:1]), batch, occupancy=several.occupancy)
+    assert one.mask.sum() > 100
+    assert (several.mask[0] == one.mask).all()
+    torch.testing.assert_close(several.depth[0][one.mask], one.depth[one.mask], rtol=0, atol=1e-3)
 
 
 def test_several_shapes_without_a_camera_are_refused() -> None:

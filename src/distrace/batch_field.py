@@ -59,7 +59,7 @@ class BatchField(Generic[Single]):
 
     def values(self, points: Float[Tensor, "*batch 3"], shape: Int[Tensor, "*#batch"]) -> Float[Tensor, "*batch"]:
         """Values at points, each of the shape of its number."""
-        each = shape if points.dim() == 2 else shape.expand(points.shape[:-1]).reshape(-1)
+        each = shape.expand(points.shape[:-1]).reshape(-1)
         return flattened(lambda flat: self.evaluate(flat, each), points)
 
 
