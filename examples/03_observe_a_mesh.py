@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from distrace.data.split import read_split
+from distrace.benchmarks.measuring import poster_view
+from distrace.data.shapes import read_split
 from distrace.data.view import observe, save_view
-from distrace.evaluation.bench import poster_view
-from distrace.evaluation.evaluate import OBSERVATION_SIZE, solid_of
 from distrace.metrics import POINTS, surface_points
+from experiments.tables.completion import OBSERVATION_SIZE, solid_of
 
 split, name, meshes, out = sys.argv[1:5]
 (shape,) = (shape for shape in read_split(split) if shape.name == name)

@@ -11,8 +11,8 @@ from pathlib import Path
 import torch
 
 import distrace as dt
+from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoint import save_model
-from distrace.evaluation.bench import poster_view
 from distrace.metrics import depth_errors, iou
 
 experiment, out = (Path(argument) for argument in sys.argv[1:3])

@@ -7,11 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from distrace.benchmarks.ablation import COUNT, NAIVE_RAYS, of_field, of_model
+from distrace.benchmarks.measuring import LONG, Case, Row, in_turn, measure, poster_view, reference_distance
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.evaluation.ablation import COUNT, NAIVE_RAYS, of_field, of_model
-from distrace.evaluation.bench import LONG, Case, Row, in_turn, measure, poster_view, reference_distance
 from distrace.field import SDF, Counted
 from distrace.primitives import box, capsule, sphere, union
 from distrace.rays import Bounds, Rays, meet_sphere
@@ -153,7 +153,7 @@ def test_times_are_medians_of_runs_in_turn_and_of_one_where_it_takes_long(monkey
 
     def measured(*runs: float) -> dict[str, tuple[float, int]]:
         times = [sum(runs[: n // 2]) + (n % 2) * runs[n // 2] for n in range(2 * len(runs))]
-        monkeypatch.setattr("distrace.evaluation.bench.time.perf_counter", iter(times).__next__)
+        monkeypatch.setattr("distrace.benchmarks.measuring.time.perf_counter", iter(times).__next__)
         results = in_turn({"first": lambda: buffers, "second": lambda: buffers}, 3)
         return {name: result[1:] for name, result in results.items()}
 

@@ -20,18 +20,21 @@ import distrace.cli
 import distrace.cli.train_samples
 import distrace.movie
 from distrace import metrics
+from distrace.benchmarks.analytic import NAMES
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
-from distrace.cli import evaluate_depth, show
+from distrace.cli import show
 from distrace.data.samples import write_samples
 from distrace.data.view import View, load_view, save_view
-from distrace.evaluation import evaluate, sparse_depth, spread_table, training_choices
-from distrace.evaluation.analytic import NAMES
 from distrace.mesh import MeshConfig
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.training.config import TrainConfig
 from distrace.training.train import start, train
+from experiments.commands import depth as evaluate_depth
+from experiments.tables import completion as evaluate
+from experiments.tables import sparse_depth, training_choices
+from experiments.tables import spread as spread_table
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}

@@ -11,10 +11,10 @@ import torch
 
 import distrace.cli
 import distrace.cli.gradients
+from distrace.benchmarks.derivatives import COUNT
+from distrace.benchmarks.untrained import ball
 from distrace.checking.gradcheck import GradientCheck, GradientRow, check_gradients
 from distrace.checkpoint import save_experiment
-from distrace.evaluation.gradients import COUNT
-from distrace.evaluation.growth import ball
 
 VIEW = ("--distance", "3", "--focal-mm", "40", "--size", "10")
 COMMON = {"seconds", "device", "version", "evaluations", "rows", "command", "machine"}

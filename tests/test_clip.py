@@ -16,12 +16,12 @@ from trimesh.visual.material import SimpleMaterial
 
 import distrace.cli
 from distrace.camera import Camera
-from distrace.data import clip, mitsuba_scene
-from distrace.data.clutter import NEAREST, boxes, sky
-from distrace.data.patches import Patch, has_images, load_patches, painted, placed
 from distrace.data.solid import Solid, load_solid, load_soup, turned
-from distrace.data.solid_texture import mottled, value_noise
 from distrace.data.view import observe
+from experiments.clips import clip, mitsuba_scene
+from experiments.clips.clutter import NEAREST, boxes, sky
+from experiments.clips.patches import Patch, has_images, load_patches, painted, placed
+from experiments.clips.solid_texture import mottled, value_noise
 
 RED, GREEN, BLUE, WHITE = (220, 30, 30), (30, 200, 30), (30, 30, 220), (230, 230, 230)
 TURN = 40.0

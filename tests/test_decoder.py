@@ -8,8 +8,8 @@ import pytest
 import torch
 from torch.func import functional_call
 
+from distrace.benchmarks.measuring import Operations
 from distrace.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.evaluation.bench import Operations
 from distrace.field import chunked
 
 torch.set_num_threads(1)

@@ -3,11 +3,11 @@
 import pytest
 import torch
 
-from distrace.evaluation.bench import poster_view, reference_depth
-from distrace.evaluation.fields import COUNT, FieldRow, field_rows, hard_fields
-from distrace.evaluation.tables import fields_page
+from distrace.benchmarks.measuring import poster_view, reference_depth
+from distrace.benchmarks.pages import fields_page
 from distrace.primitives import box, union
 from distrace.render import render
+from experiments.costs.fields import COUNT, FieldRow, field_rows, hard_fields
 
 SOFA = union(box(torch.tensor([0.6, 0.15, 0.3])), box(torch.tensor([0.15, 0.5, 0.3])))
 NAMES = ["decoder × 2", "thin plate", "high frequencies", "gap of a pixel", "clamped"]

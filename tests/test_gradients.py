@@ -9,14 +9,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace import primitives
+from distrace.benchmarks.derivatives import COUNT, QUERIES, RatioRow, ratio_rows, subjects
+from distrace.benchmarks.untrained import ball
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives
 from distrace.checking.gradcheck import check_gradients
 from distrace.checking.moves import Move, all_moves
 from distrace.checking.retrace import DOUBLE, Retraced
 from distrace.checkpoint import Model
-from distrace.evaluation.gradients import COUNT, QUERIES, RatioRow, ratio_rows, subjects
-from distrace.evaluation.growth import ball
 from distrace.field import SDF
 
 f64 = torch.float64

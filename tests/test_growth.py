@@ -5,12 +5,12 @@ from pathlib import Path
 import pytest
 import torch
 
+from distrace.benchmarks.measuring import poster_view, reference_distance
+from distrace.benchmarks.pages import growth_page
 from distrace.checkpoint import load_model
-from distrace.evaluation import growth
-from distrace.evaluation.bench import poster_view, reference_distance
-from distrace.evaluation.tables import growth_page
 from distrace.primitives import sphere
 from distrace.rays import meet_sphere
+from experiments.costs import growth
 
 
 @pytest.fixture(autouse=True)

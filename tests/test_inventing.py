@@ -9,10 +9,10 @@ import trimesh
 from manifold3d import Manifold, OpType
 
 from distrace.cli.train_samples import sample_files
-from distrace.data.inventing import INVENTORS, invented
-from distrace.data.inventing.foot import foot
-from distrace.data.inventing.parts import Part, block, bowed, disc, rod, row, sheet, tilted
-from distrace.data.inventing.shell import bent, tub
+from experiments.procedural import INVENTORS, invented
+from experiments.procedural.foot import foot
+from experiments.procedural.parts import Part, block, bowed, disc, rod, row, sheet, tilted
+from experiments.procedural.shell import bent, tub
 
 CLASSES = tuple(INVENTORS)
 

@@ -18,8 +18,12 @@ from distrace.checkpoint import Model, save_model
 from distrace.cli import main
 from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
 from distrace.data.solid import Solid
-from distrace.evaluation.clip_page import LIMIT, comparison, save_clip_page
-from distrace.evaluation.multiview_table import (
+from distrace.photographs.fit_photos import KNOWN_PLACE
+from distrace.pose import Similarity
+from distrace.render import render
+from distrace.shading import error_picture
+from experiments.tables.clip_page import LIMIT, comparison, save_clip_page
+from experiments.tables.multiview import (
     ClipResult,
     ClipTrial,
     clip_done,
@@ -29,10 +33,6 @@ from distrace.evaluation.multiview_table import (
     settings_of,
     surface_of,
 )
-from distrace.photographs.fit_photos import KNOWN_PLACE
-from distrace.pose import Similarity
-from distrace.render import render
-from distrace.shading import error_picture
 
 
 @pytest.fixture
@@ -152,7 +152,7 @@ def test_a_trial_leaves_its_surface_and_is_done_again_without_it(
 
     for module in ("multiview_table", "clip_page"):
         monkeypatch.setattr(f"distrace.evaluation.{module}.true_solid", lambda *given: Solid(ball, ball))
-    monkeypatch.setattr("distrace.evaluation.multiview_table.stereo_points", found)
+    monkeypatch.setattr("experiments.tables.multiview.stereo_points", found)
     trial = ClipTrial(tmp_path / "clip", "stereo", tmp_path, tmp_path / "out", str(model))
     result = clip_done(trial)
     assert clip_done(trial) == result

@@ -6,9 +6,9 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
-from distrace.data.noise import NOISES, SIZE, STEP, noisy
 from distrace.data.solid import Solid
 from distrace.data.view import View, observe
+from experiments.datasets.noise import NOISES, SIZE, STEP, noisy
 
 CAMERA = Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=96, width=96)
 

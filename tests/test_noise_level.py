@@ -7,10 +7,10 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
-from distrace.data.noise import SIZE, noisy
 from distrace.data.solid import Solid
 from distrace.data.view import View, observe
 from distrace.fitting.noise_level import LEAST, expected, noise_of
+from experiments.datasets.noise import SIZE, noisy
 
 CAMERA = Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=256, width=256)
 

@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from distrace.evaluation.pose_table import (
+from distrace.pose import pose_error
+from experiments.tables.pose import (
     DISTURBANCES,
     FOCAL,
     OBSERVATIONS,
@@ -20,7 +21,6 @@ from distrace.evaluation.pose_table import (
     rows_of,
     write_trials,
 )
-from distrace.pose import pose_error
 
 
 def found(k: int, degrees: float, observation: str = "depth", disturbance: str = "10°") -> Found:

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from distrace.benchmarks import agreement as views
+from distrace.benchmarks import analytic
+from distrace.benchmarks.agreement import ViewRow, badness, largest_part, measure_view, summaries
+from distrace.benchmarks.agreement_page import agreement_page, described, pictures_of, worst_picture
+from distrace.benchmarks.measuring import reference_depth, reference_distance
+from distrace.benchmarks.random_views import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
 from distrace.camera import Camera
 from distrace.checkpoint import Model, load_model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.evaluation import analytic, views
-from distrace.evaluation.bench import reference_depth, reference_distance
-from distrace.evaluation.shots import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
-from distrace.evaluation.views import ViewRow, badness, largest_part, measure_view, summaries
-from distrace.evaluation.views_page import agreement_page, described, pictures_of, worst_picture
 from distrace.primitives import box, difference, sphere, union
 from distrace.rays import Rays, meet_sphere
 from distrace.render import STRATEGIES, render

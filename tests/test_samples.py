@@ -13,9 +13,10 @@ import trimesh
 from distrace import primitives
 from distrace.data import sampling
 from distrace.data.samples import THIN, Doubt, doubt, lost, sample, write_samples
+from distrace.data.shapes import Shape, every_mesh
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, normalised_frame
-from distrace.data.split import CLASSES, Shape, every_mesh, read_split
 from distrace.training.batches import load_samples
+from experiments.datasets.splits import CLASSES, read_split
 
 CUBE = RADIUS / math.sqrt(3) * 2  # the edge of a normalised cube
 COUNT = 5000

@@ -9,7 +9,7 @@ from photographed import striped_ball
 from test_fit_photos import ring
 
 from distrace.data.photograph import Photograph
-from distrace.evaluation.semi_global import Rectified, stereo_points
+from experiments.baselines.semi_global import Rectified, stereo_points
 
 FINER = 1.5  # stripes than those that patches are compared on
 

@@ -8,14 +8,14 @@ import torch
 import trimesh
 
 from distrace.batch_field import BatchField
+from distrace.benchmarks.pages import solvers_page
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.data.view import View
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.evaluation import solvers
-from distrace.evaluation.tables import solvers_page
 from distrace.fitting.starts import Step
 from distrace.rays import meet_sphere
+from experiments.costs import solvers
 
 
 class Spheres(Decoder):

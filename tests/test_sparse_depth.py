@@ -12,10 +12,15 @@ from pretended import DEVICE, pretended
 
 from distrace.checkpoint import Model, save_model
 from distrace.decoder import Decoder, NetworkSpecs
-from distrace.evaluation import focal_test, sparse_depth
-from distrace.evaluation.depth_tables import AXES, depth_page, ratios, rows_of, wide
-from distrace.evaluation.focal_test import looks
-from distrace.evaluation.sparse_depth import (
+from distrace.fitting.staged import CodeFitConfig
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.rays import meet_sphere
+from experiments.tables import focal as focal_test
+from experiments.tables import sparse_depth
+from experiments.tables.depth_tables import AXES, depth_page, ratios, rows_of, wide
+from experiments.tables.focal import looks
+from experiments.tables.sparse_depth import (
     AZIMUTHS_ELEVATIONS,
     CONDITIONS,
     DENSITIES,
@@ -29,11 +34,7 @@ from distrace.evaluation.sparse_depth import (
     observed,
     true_solid,
 )
-from distrace.evaluation.trials import Place
-from distrace.fitting.staged import CodeFitConfig
-from distrace.mesh import MeshConfig, extract_mesh
-from distrace.metrics import chamfer
-from distrace.rays import meet_sphere
+from experiments.tables.trials import Place
 
 METHODS = ("deepsdf", "ours", "ours+mask")
 

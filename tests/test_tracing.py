@@ -10,11 +10,10 @@ from torch import Tensor
 
 from distrace import primitives
 from distrace.batch_field import CountedBatch
+from distrace.benchmarks.measuring import Operations, poster_view, recorded, reference_distance
 from distrace.camera import Camera
 from distrace.checkpoint import load_model
 from distrace.errors import DoubtfulResult
-from distrace.evaluation.bench import Operations, poster_view, reference_distance
-from distrace.evaluation.growth import recorded
 from distrace.field import SDF, Counted
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render

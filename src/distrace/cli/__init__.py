@@ -3,17 +3,16 @@
 import io
 import re
 import sys
+from collections.abc import Mapping
 from contextlib import redirect_stderr
 
 import torch
 import tyro
 
 from distrace.cli.bench import Bench
-from distrace.cli.clip import Clip
 from distrace.cli.complete import Complete, Demo
 from distrace.cli.console import errors
-from distrace.cli.data import Data, Invent, Sample
-from distrace.cli.evaluate import Evaluate
+from distrace.cli.data import Data, Sample
 from distrace.cli.gradients import CheckGradients
 from distrace.cli.multiview import Multiview
 from distrace.cli.pose import Pose
@@ -30,12 +29,9 @@ COMMANDS = {
     "multiview": Multiview,
     "reconstruct": Reconstruct,
     "data": Data,
-    "invent": Invent,
     "sample": Sample,
-    "clip": Clip,
     "train": Train,
     "bench": Bench,
-    "evaluate": Evaluate,
     "check-gradients": CheckGradients,
 }
 
@@ -43,27 +39,33 @@ ABOUT = "Render neural signed distance functions, and fit them to what was obser
 
 
 def main() -> None:
+    run_commands(COMMANDS, "distrace", ABOUT)
+
+
+def run_commands(commands: Mapping[str, type], program: str, about: str) -> None:
+    """Does what the command line says; ends the process where that fails."""
+    sys.argv[0] = program  # as recorded tables name it
     try:
-        _run(sys.argv[1:])
+        _run(sys.argv[1:], commands, program, about)
     except KeyboardInterrupt:
-        _end(
-            "stopped; what is written is whole; train, reconstruct, sample, clip and most tables of evaluate go on from"
-            " there",
-            130,
-        )
+        _end(program, "stopped; what is written is whole, and what takes long goes on from there", 130)
     except (ValueError, OSError) as error:
-        _end(str(error), 2)
+        _end(program, str(error), 2)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
             raise
-        _end("there is not enough memory for that; use a smaller size, or --device cpu", 2)
+        _end(program, "there is not enough memory for that; use a smaller size, or --device cpu", 2)
 
 
-def _run(arguments: list[str]) -> None:
+def _run(
+    arguments: list[str], commands: Mapping[str, type] = COMMANDS, program: str = "distrace", about: str = ABOUT
+) -> None:
     said = io.StringIO()
     try:
         with redirect_stderr(said):
-            command = tyro.extras.subcommand_cli_from_dict(COMMANDS, args=arguments, prog="distrace", description=ABOUT)
+            command = tyro.extras.subcommand_cli_from_dict(
+                dict(commands), args=arguments, prog=program, description=about
+            )
     except SystemExit as stop:
         if stop.code:
             raise ValueError(_one_line(said.getvalue())) from None
@@ -80,6 +82,6 @@ def _one_line(box: str) -> str:
     return " ".join(words).removeprefix("Parsing error ").removeprefix("Unrecognized options ")
 
 
-def _end(sentence: str, status: int) -> None:
-    errors.print(f"distrace: {' '.join(sentence.split())}", markup=False, highlight=False)
+def _end(program: str, sentence: str, status: int) -> None:
+    errors.print(f"{program}: {' '.join(sentence.split())}", markup=False, highlight=False)
     sys.exit(status)

@@ -4,13 +4,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from distrace.benchmarks import analytic
+from distrace.benchmarks.agreement import Measured, badness, measure_view, summaries
+from distrace.benchmarks.agreement_page import agreement_page, worst_picture
+from distrace.benchmarks.random_views import View, model_views
 from distrace.checkpoint import Model, bundled_models, load_model
 from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, console, origin, progress
-from distrace.evaluation import analytic
-from distrace.evaluation.shots import View, model_views
-from distrace.evaluation.views import Measured, badness, measure_view, summaries
-from distrace.evaluation.views_page import agreement_page, worst_picture
 from distrace.files import save_text
 from distrace.render import STRATEGIES
 from distrace.shading import save_png

@@ -19,9 +19,6 @@ from distrace.pages.report import View
 from distrace.render import Buffers
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
-Meshes = Annotated[
-    Path, tyro.conf.arg(help="as `distrace data furniture` and `… planes` make them, in folders of their own")
-]
 Views = Annotated[
     Path,
     tyro.conf.arg(

@@ -8,13 +8,13 @@ import torch
 import trimesh
 
 from distrace import shading
+from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.cli.common import save_mesh
 from distrace.cli.console import Run, console, progress
 from distrace.data.cloud import Cloud
 from distrace.data.view import View
-from distrace.evaluation.bench import poster_view
 from distrace.files import written
 from distrace.fitting.consistent import LEFT_OUT, completed
 from distrace.fitting.fit import FitConfig

@@ -137,4 +137,4 @@ def machine() -> str:
 
 def origin() -> dict[str, str]:
     """What a recorded table was made by, and on."""
-    return {"command": " ".join(["distrace", *sys.argv[1:]]), "machine": machine()}
+    return {"command": " ".join(sys.argv), "machine": machine()}

@@ -1,27 +1,19 @@
-"""`data`, `invent` and `sample`: from packages of meshes, or from nothing, to signed samples."""
+"""`data` and `sample`: from packages of meshes to signed samples."""
 
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 import tyro
 
 from distrace.cli.common import Flag
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
 from distrace.data.catalogue import summary
-from distrace.data.inventing import invented
 from distrace.data.samples import Doubt
-from distrace.data.solid import Solid, normalised
-from distrace.data.split import every_mesh, read_split
-from distrace.data.view import pictured
-from distrace.evaluation.bench import poster_view
-from distrace.files import written
-from distrace.shading import in_rows, save_png
+from distrace.data.shapes import every_mesh, read_split
 
-PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
 PREPARED = {"furniture": furniture.prepare, "planes": planes.prepare, "parked-planes": planes.prepare_parked}
 
 
@@ -45,39 +37,12 @@ class Data:
 
 
 @dataclass(frozen=True)
-class Invent:
-    """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
-
-    category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
-    count: int = 240
-    out: Path | None = None  # by default out/invented-sofas and so on
-    seed: int = 0
-
-    def run(self) -> None:
-        run = start(self.out or Path("out") / f"invented-{self.category}")
-        if self.count < 1:
-            raise ValueError(f"--count {self.count} was given; at least one shape is needed")
-        pictures = []
-        with progress("inventing", self.count) as bar:
-            for number in range(1, self.count + 1):
-                mesh = invented(self.category, np.random.default_rng([self.seed, number]))
-                with written(run.out / f"{self.category}~{number}.ply") as part:
-                    mesh.export(part, file_type="ply")
-                if number <= PREVIEWED:
-                    scaled = normalised(mesh)
-                    pictures.append(pictured(Solid(scaled, scaled), poster_view(TILE)))
-                bar.advance(str(number))
-        save_png(run.out / "preview.png", in_rows(pictures, ACROSS))
-        run.finish({"class": self.category, "meshes": self.count, "seed": self.seed})
-
-
-@dataclass(frozen=True)
 class Sample:
     """Turn meshes, watertight or not, into signed samples in DeepSDF's .npz; goes on where it was stopped."""
 
     meshes: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="MESHES")]]  # a folder, as `data` makes it
     out: Path = Path("out/samples")
-    split: str | None = None  # a bundled split (sofas) or a CSV file; without one, every mesh below the folder
+    split: Path | None = None  # a CSV file that lists shapes; without one, every mesh below the folder
     count: int = 500_000  # samples of each shape
     mirror: Flag = False  # also the mirror image of training shapes that have another
     variants: int = 0  # also so many copies of each training shape, warped at random

@@ -8,12 +8,12 @@ from typing import Any
 import torch
 import tyro
 
+from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoint import Model, save_experiment
 from distrace.cli.common import Every, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.decoder import NetworkSpecs
-from distrace.evaluation.bench import poster_view
 from distrace.files import alone
 from distrace.pages.charts import save_course
 from distrace.pages.report import View

@@ -7,19 +7,19 @@ from pathlib import Path
 from distrace.checkpoint import original
 from distrace.cli.data import sampled
 from distrace.data import sampling
-from distrace.data.split import every_mesh, has_meshes, on_side
+from distrace.data.shapes import every_mesh, has_meshes, read_split
 
 MESH_SAMPLES = 200_000  # of each mesh
 
 
-def sample_files(given: Path, out: Path, splits: Sequence[str] = ()) -> list[Path]:
+def sample_files(given: Path, out: Path, splits: Sequence[Path] = ()) -> list[Path]:
     """Files of a folder of samples, those of splits if any is named; of a folder of meshes, sampled below `out`."""
     has_samples = any(given.glob("*.npz")) or not has_meshes(given)
     folder = given if has_samples else _sampled_meshes(given, out / "samples")
     paths = sorted(folder.glob("*.npz"))
     if splits:
-        learnt = {shape.name for split in splits for shape in on_side("train", split)}
-        wanted = learnt.union(splits)  # what was invented is called sofas~1
+        learnt = {shape.name for split in splits for shape in read_split(split) if shape.split == "train"}
+        wanted = learnt.union(split.stem for split in splits)  # what was invented is called sofas~1
         paths = [path for path in paths if original(path.stem) in wanted]
     if not paths:
         what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"

@@ -15,7 +15,7 @@ import trimesh
 from jaxtyping import Bool, Float
 
 from distrace.data.ac3d import load_ac3d
-from distrace.data.split import Shape
+from distrace.data.shapes import Shape
 from distrace.errors import explained
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)

@@ -1,0 +1,41 @@
+"""The one entry: `python -m experiments NAME`, from the repository's root."""
+
+from distrace.cli import run_commands
+from experiments.commands.clip import Clip
+from experiments.commands.costs import Fields, Growth, Memory, Solvers
+from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
+from experiments.commands.photographs import Photographs
+from experiments.commands.procedural import Invent
+from experiments.commands.tables import Completion, HeldOut, Pose, Training
+from experiments.commands.training_data import Card, Choices, Splits
+
+COMMANDS = {
+    "fields": Fields,
+    "growth": Growth,
+    "memory": Memory,
+    "solvers": Solvers,
+    "training": Training,
+    "held-out": HeldOut,
+    "completion": Completion,
+    "sparse-depth": SparseDepth,
+    "noise": Noise,
+    "focal": Focal,
+    "spread": Spread,
+    "pose": Pose,
+    "multiview": Multiview,
+    "photographs": Photographs,
+    "splits": Splits,
+    "choices": Choices,
+    "card": Card,
+    "clip": Clip,
+    "procedural": Invent,
+}
+ABOUT = "Measure what distrace can do, and make what it is measured on. Results go to the folder --out."
+
+
+def main() -> None:
+    run_commands(COMMANDS, "python -m experiments", ABOUT)
+
+
+if __name__ == "__main__":
+    main()

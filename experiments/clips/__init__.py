@@ -1,0 +1,1 @@
+"""Images of held-out shapes from all around, by an independent renderer."""

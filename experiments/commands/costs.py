@@ -1,0 +1,116 @@
+"""What tracing costs as images, networks and views grow, where it is wrong, and how fast solvers complete shapes."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+import tyro
+
+from distrace.benchmarks.measuring import poster_view
+from distrace.cli.bench import finish, rows_of, show
+from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.console import origin, progress, start
+from distrace.files import save_text
+from experiments.costs import fields, growth, pages, solvers
+from experiments.datasets.splits import on_side
+
+Name = tyro.conf.Positional[ModelName]
+
+
+@dataclass(frozen=True)
+class Fields:
+    """Which pixels each strategy gets wrong on fields that break what sphere tracing assumes."""
+
+    model: Name = "sofas"
+    out: Path = Path("out/fields")
+    code: int = 0  # which training shape
+    size: int = 512  # pixels along each side
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        decoder = opened(self.model, run.device).field(self.code)
+        rows = []
+        with progress("fields", fields.COUNT) as bar:
+            for row in fields.field_rows(decoder, poster_view(self.size).to(run.device)):
+                rows.append(row)
+                bar.advance(f"{row.field}, {row.strategy}")
+        save_text(run.out / "index.html", pages.fields_page(rows))
+        finish(run, rows_of(self.model, rows))
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How the cost grows with the sizes of image and network, and with the numbers of views and shapes."""
+
+    model: Name = "sofas"
+    out: Path = Path("out/growth")
+    code: int = 0  # which training shape
+    repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
+    device: str = "cpu"
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        model = opened(self.model, run.device)
+        field = model.field(self.code)
+        axes = (
+            growth.by_size(field, self.repeats, run.device),
+            growth.by_network(self.repeats, run.device),
+            growth.by_views(field, self.repeats, run.device),
+            growth.by_shapes(model, self.repeats),
+        )
+        rows = []
+        with progress("growth", growth.COUNT) as bar, torch.no_grad():
+            for axis in axes:
+                for row in axis:
+                    rows.append(row)
+                    bar.advance(f"{row.axis} {row.value}, {row.strategy}: {row.seconds:.2f} s")
+        save_text(run.out / "index.html", pages.growth_page(rows))
+        finish(run, rows_of(self.model, rows))
+
+
+@dataclass(frozen=True)
+class Memory:
+    """How much memory one image takes beyond the weights, up to 4096 × 4096 pixels."""
+
+    model: Name = "sofas"
+    out: Path = Path("out/memory")
+    code: int = 0  # which training shape
+
+    def run(self) -> None:
+        run = start(self.out)
+        opened(self.model, run.device)
+        rows = []
+        with progress("memory", len(growth.MEASURED)) as bar:
+            for size in growth.MEASURED:
+                mib = growth.peak_memory(self.model, self.code, size)
+                rows.append({"model": self.model, "pixels": size, "mib": mib})
+                bar.advance(f"{size} × {size}: {mib:.0f} MiB")
+        show_table(rows)
+        run.finish({"rows": rows, **origin()})
+
+
+@dataclass(frozen=True)
+class Solvers:
+    """How fast Adam and Levenberg–Marquardt complete the held-out shapes."""
+
+    model: Name = "sofas"
+    split: str = "sofas"  # whose held-out shapes are completed
+    meshes: Path = Path("out/furniture")  # as `distrace data furniture` makes it
+    out: Path = Path("out/solvers")
+
+    def run(self) -> None:
+        run = start(self.out)
+        model = opened(self.model, run.device)
+        shapes = on_side("test", self.split)
+        measured = []
+        with progress("solvers", 2 * len(shapes) * len(solvers.POINTS)) as bar:
+            for row, curve in solvers.solver_rows(model, shapes, self.meshes, solvers.RESOLUTION):
+                measured.append((row, curve))
+                bar.advance(f"{row.shape}, {row.points or 'all'} depths, {row.solver}: {row.loss:.4f}")
+        save_text(run.out / "index.html", pages.solvers_page(measured))
+        rows = rows_of(self.model, [row for row, _ in measured])
+        show(rows)
+        curves = [{"seconds": curve.seconds, "losses": curve.losses} for _, curve in measured]
+        evaluations = sum(row["evaluations"] for row in rows)
+        run.finish({"rows": rows, "curves": curves, **origin(), "evaluations": evaluations})

@@ -1,0 +1,191 @@
+"""The tables of completion from one view, and of clips."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from statistics import median
+
+import tyro
+
+from distrace.cli.common import show_table
+from distrace.cli.console import console, origin, progress, start
+from distrace.files import save_text
+from distrace.fitting.methods import METHODS
+from distrace.processes import each_done
+from experiments.datasets.splits import CLASSES, Meshes
+from experiments.tables import depth_tables
+from experiments.tables.clip_page import save_clip_page
+from experiments.tables.focal import look_rows, looks
+from experiments.tables.multiview import METHODS as METHODS_OF_CLIPS
+from experiments.tables.multiview import ClipTrial, clip_done, described, multiview_rows, settings_of
+from experiments.tables.sparse_depth import (
+    AZIMUTHS_ELEVATIONS,
+    CONDITIONS,
+    Done,
+    Trial,
+    all_trials,
+    done,
+    held_out,
+)
+from experiments.tables.spread import spread_rows
+from experiments.tables.trials import Place
+
+
+@dataclass(frozen=True)
+class _DepthTable:
+    classes: tuple[str, ...] = CLASSES  # bundled splits, or CSV files
+    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
+    shapes: int | None = None  # held-out ones of each class; by default all
+    views: int = len(AZIMUTHS_ELEVATIONS)  # of each shape
+    meshes: Meshes = Path("out")
+    out: Path = Path("out/evaluate")
+    resolution: int = 192  # of the meshes that are compared
+    jobs: int = 2  # processes
+    device: str = "cpu"
+
+    def _run(self, name: str, more: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
+        """Each trial leaves a file in `trials`; what is there already is not done again. `more` facts may follow."""
+        checked(self.jobs, self.shapes, self.views)
+        run, models = start(self.out, self.device), paired(self.classes, self.models)
+        place = Place(self.meshes, run.out, models, self.resolution, run.device)
+        trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
+        results: list[Done] = []
+        with progress(name, len(trials)) as bar:
+            for each in each_done(partial(done, place), trials, self.jobs):
+                results.append(each)
+                bar.advance(f"{each.trial.shape}, {each.trial.method}: {each.chamfer:.2f}")
+        order = {trial: number for number, trial in enumerate(trials)}
+        results.sort(key=lambda each: order[each.trial])
+        rows = depth_tables.rows_of(results, depth_tables.AXES[name])
+        header, cells = depth_tables.wide(rows, depth_tables.AXES[name])
+        show_table([dict(zip(header, line, strict=True)) for line in cells])
+        save_text(run.out / "index.html", depth_tables.depth_page(name, results, place))
+        facts = {
+            "rows": rows,
+            "ratios": depth_tables.ratios(rows, depth_tables.AXES[name]),
+            "instances": [each.row() for each in results],
+            "evaluations": sum(each.evaluations for each in results),
+        }
+        run.finish({**facts, **more(place, trials), **origin()})
+
+
+@dataclass(frozen=True)
+class SparseDepth(_DepthTable):
+    """The published table: held-out shapes completed from ever fewer depths of one view. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("sparse-depth")
+
+
+@dataclass(frozen=True)
+class Noise(_DepthTable):
+    """The same from a tenth of the depths, disturbed: noise, steps, outliers, holes. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("noise")
+
+
+@dataclass(frozen=True)
+class Focal(_DepthTable):
+    """The same from a tenth of the depths, seen at other focal lengths; and what was fitted at one, looked at through
+    the others. A second run goes on."""
+
+    def run(self) -> None:
+        self._run("focal", self._tested)
+
+    def _tested(self, place: Place, trials: list[Trial]) -> dict:
+        usual, found = [trial for trial in trials if trial.focal_ratio == 1.0], []
+        with progress("looking through others", len(usual)) as bar:
+            for some in each_done(partial(looks, place), usual, self.jobs):
+                found += some
+                bar.advance()
+        rows = sorted(look_rows(found), key=lambda row: (self.classes.index(str(row["class"])), str(row["method"])))
+        show_table(rows)
+        return {"tests": rows}
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Whether several completions are apart where one of them is wrong."""
+
+    classes: tuple[str, ...] = CLASSES
+    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
+    shapes: int | None = None  # held-out ones of each class; by default all
+    meshes: Meshes = Path("out")
+    out: Path = Path("out/evaluate")
+    jobs: int = 2  # processes
+
+    def run(self) -> None:
+        checked(self.jobs, self.shapes)
+        run, rows = start(self.out), []
+        models = paired(self.classes, self.models)
+        chosen = {category: held_out(category, self.shapes) for category in self.classes}
+        with progress("spread", sum(map(len, chosen.values()))) as bar:
+            for category, model in models:
+                for row in spread_rows(category, chosen[category], model, self.meshes, self.jobs):
+                    rows.append(asdict(row))
+                    bar.advance(f"{row.shape}: {row.correlation:.2f}")
+        show_table(rows)
+        middle = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
+        console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in middle.items()))
+        run.finish({"rows": rows, "median_correlation": middle, **origin()})
+
+
+@dataclass(frozen=True)
+class Multiview:
+    """Held-out shapes from clips: ours, masks alone, the nearest training shape, stereo. A second run goes on.
+
+    Each clip has a page with its frames, what each method found, and how far that is from the truth.
+    """
+
+    clips: tyro.conf.Positional[tuple[Path, ...]]  # folders as `distrace clip` makes them
+    methods: tuple[str, ...] = METHODS_OF_CLIPS
+    model: str | None = None  # by default the bundled one of a clip's split
+    meshes: Meshes = Path("out")
+    out: Path = Path("out/evaluate")
+    jobs: int = 2  # processes
+
+    def run(self) -> None:
+        checked(self.jobs, None)
+        if not self.clips:
+            raise ValueError("no clips were given; give folders as `distrace clip` makes them")
+        for method in self.methods:
+            settings_of(method)
+        for folder in self.clips:
+            described(folder)
+        run, results = start(self.out), []
+        of_clip = {
+            clip: [ClipTrial(clip, method, self.meshes, run.out, self.model) for method in self.methods]
+            for clip in self.clips
+        }
+        trials = [trial for some in of_clip.values() for trial in some]
+        with progress("multiview", len(trials)) as bar:
+            for each in each_done(clip_done, trials, self.jobs):
+                results.append(each)
+                bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
+        results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))
+        for clip, some in of_clip.items():
+            save_clip_page(run.out / "pages", clip, some, self.meshes)
+        rows = multiview_rows(results)
+        show_table(rows)
+        run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})
+
+
+def checked(jobs: int, shapes: int | None, views: int = 1) -> None:
+    """Raises `ValueError` for numbers that make no table."""
+    if jobs < 1 or not 1 <= views <= len(AZIMUTHS_ELEVATIONS) or (shapes is not None and shapes < 1):
+        given = f"--jobs {jobs} --views {views}" + ("" if shapes is None else f" --shapes {shapes}")
+        raise ValueError(f"{given} were given; at least 1 of each are needed, and at most 4 views")
+
+
+def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """Each class with its model. Raises `ValueError` for more or fewer of them."""
+    models = models or classes
+    if not classes:
+        raise ValueError(f"--classes names none; give some of {', '.join(CLASSES)}, or CSV files")
+    if len(models) != len(classes):
+        given = f"{len(models)} models ({', '.join(models)}) were given"
+        raise ValueError(f"{given} for {len(classes)} classes ({', '.join(classes)}); give one each")
+    return tuple(zip(classes, models, strict=True))

@@ -1,0 +1,45 @@
+"""Shapes of a class put together at random."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import tyro
+
+from distrace.benchmarks.measuring import poster_view
+from distrace.cli.console import progress, start
+from distrace.data.solid import Solid, normalised
+from distrace.data.view import pictured
+from distrace.files import written
+from distrace.shading import in_rows, save_png
+from experiments.procedural import invented
+
+PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
+
+
+@dataclass(frozen=True)
+class Invent:
+    """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
+
+    category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
+    count: int = 240
+    out: Path | None = None  # by default out/invented-sofas and so on
+    seed: int = 0
+
+    def run(self) -> None:
+        run = start(self.out or Path("out") / f"invented-{self.category}")
+        if self.count < 1:
+            raise ValueError(f"--count {self.count} was given; at least one shape is needed")
+        pictures = []
+        with progress("inventing", self.count) as bar:
+            for number in range(1, self.count + 1):
+                mesh = invented(self.category, np.random.default_rng([self.seed, number]))
+                with written(run.out / f"{self.category}~{number}.ply") as part:
+                    mesh.export(part, file_type="ply")
+                if number <= PREVIEWED:
+                    scaled = normalised(mesh)
+                    pictures.append(pictured(Solid(scaled, scaled), poster_view(TILE)))
+                bar.advance(str(number))
+        save_png(run.out / "preview.png", in_rows(pictures, ACROSS))
+        run.finish({"class": self.category, "meshes": self.count, "seed": self.seed})

@@ -1,0 +1,56 @@
+"""Which pixels every strategy gets wrong on fields that are not what sphere tracing assumes."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from distrace.benchmarks.hard_fields import hard_fields
+from distrace.benchmarks.measuring import OUTLIER, reference_depth
+from distrace.camera import Camera
+from distrace.field import SDF
+from distrace.metrics import depth_errors
+from distrace.render import STRATEGIES, render
+from distrace.trace import Outcome
+
+COUNT = 5 * len(STRATEGIES)  # of rows
+
+
+@dataclass(frozen=True)
+class FieldRow:
+    """How many pixels one strategy gets wrong on one field, and how many of those it admits (EXHAUSTED)."""
+
+    field: str
+    strategy: str
+    visible: int
+    wrong: int  # hit or not, or depth, by more than a thousandth
+    admitted: int
+    exhausted: int  # of all pixels
+    queries: int
+
+
+def field_rows(decoder: SDF, camera: Camera) -> Iterator[FieldRow]:
+    """Every strategy on every field."""
+    for name, hard in hard_fields(decoder, camera).items():
+        truth = reference_depth(lambda points, hard=hard: hard.sdf(points) / hard.steepest, camera)
+        for strategy, config in STRATEGIES.items():
+            with torch.no_grad():
+                buffers = render(hard.sdf, camera, config=config)
+            wrong = _wrong(buffers.depth, truth)
+            exhausted = buffers.trace.outcome == Outcome.EXHAUSTED
+            yield FieldRow(
+                name,
+                strategy,
+                visible=int(torch.isfinite(truth).sum()),
+                wrong=int(wrong.sum()),
+                admitted=int((wrong & exhausted).sum()),
+                exhausted=int(exhausted.sum()),
+                queries=buffers.trace.total_evaluations,
+            )
+
+
+def _wrong(depth: Tensor, truth: Tensor) -> Tensor:
+    both = torch.isfinite(depth) & torch.isfinite(truth)
+    off = torch.zeros_like(both).masked_scatter(both, depth_errors(depth, truth) > OUTLIER)
+    return (torch.isfinite(depth) != torch.isfinite(truth)) | off

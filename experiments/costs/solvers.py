@@ -1,0 +1,125 @@
+"""Adam against Levenberg–Marquardt: held-out shapes completed by both, and how the loss that Adam lowers falls."""
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+import trimesh
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.benchmarks.measuring import poster_view
+from distrace.checkpoint import Model
+from distrace.data.shapes import Shape
+from distrace.data.solid import solid_of
+from distrace.data.view import View, observe
+from distrace.fitting.code_residuals import Comparison
+from distrace.fitting.fit import FitConfig, fit_shape, view_terms
+from distrace.fitting.fit_code import fit_code
+from distrace.fitting.staged import CodeFitConfig
+from distrace.fitting.starts import Step
+from distrace.fitting.targets import Pool
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.prior import Prior, prior_of
+from experiments.tables.completion import OBSERVATION_SIZE
+
+ADAM = FitConfig(iterations=200, starts=1)
+# Adam's own loss, far down
+SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, robust=0, sharpening=0, compared=Comparison())
+POINTS = (100,)  # observed depths; 0: all of them
+RAYS = 1000  # with a depth, and as many of the silhouette, on which the loss of every curve is measured
+RESOLUTION = 128  # of the meshes that are compared
+APART = 20  # iterations of Adam between two measurements
+
+Loss = Callable[[Float[Tensor, "length"]], float]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """The loss of a fit after some of its steps, and what they had taken until then."""
+
+    seconds: list[float]
+    losses: list[float]
+    evaluations: int  # of all steps
+    code: Float[Tensor, "length"]
+
+    def reached(self, loss: float) -> float | None:
+        """When the loss was no larger than that, if it ever was."""
+        return next((t for t, value in zip(self.seconds, self.losses, strict=True) if value <= loss), None)
+
+
+@dataclass(frozen=True)
+class SolverRow:
+    """A fit from the mean shape: its last loss, and when it had reached Adam's, as a part of Adam's time."""
+
+    shape: str
+    points: int  # observed; 0: every pixel's
+    solver: str
+    seconds: float
+    loss: float
+    reached: float | None
+    ratio: float | None
+    evaluations: int
+    chamfer: float
+
+
+def solver_rows(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[tuple[SolverRow, Curve]]:
+    """Each held-out shape completed from some and from all depths of one view and its mask, by both."""
+    for shape in shapes:
+        solid = solid_of(shape, meshes)
+        full = replace(observe(solid, poster_view(OBSERVATION_SIZE)), normal=None)
+        for points in POINTS:
+            view = full.sparse(points, ADAM.seed) if points else full
+            yield from compared(model, shape.name, points, view, solid.surface, resolution)
+
+
+def compared(
+    model: Model, shape: str, points: int, view: View, truth: trimesh.Trimesh, resolution: int
+) -> Iterator[tuple[SolverRow, Curve]]:
+    """Adam first, for its last loss is the other's aim."""
+    prior = prior_of(model.codes)
+    loss, decoder = common_loss(model, view, prior), model.decoder
+    adam = measured(fit_shape(decoder, [view], prior, ADAM), APART, loss)
+    curves = {"adam": adam, "lm": measured(fit_code(decoder, [view], prior, SOLVER), 1, loss)}
+    for name, curve in curves.items():
+        reached = curve.reached(adam.losses[-1])
+        yield (
+            SolverRow(
+                shape,
+                points,
+                name,
+                curve.seconds[-1],
+                curve.losses[-1],
+                reached,
+                None if reached is None else reached / adam.seconds[-1],
+                curve.evaluations,
+                chamfer(extract_mesh(model.field(curve.code), MeshConfig(resolution)), truth).sum,
+            ),
+            curve,
+        )
+
+
+def common_loss(model: Model, view: View, prior: Prior) -> Loss:
+    """What `fit_shape` lowers, on rays that stay the same."""
+    targets = Pool.of(view).draw(RAYS, RAYS, torch.Generator().manual_seed(ADAM.seed + 1))
+
+    @torch.no_grad()
+    def loss(code: Float[Tensor, "length"]) -> float:
+        w = prior.coordinates(code)
+        terms = view_terms(model.field(code), [targets], ADAM)
+        return float(torch.stack(list(terms.values())).sum() + ADAM.weights.code * w.square().mean())
+
+    return loss
+
+
+def measured(steps: Iterable[Step], every: int, loss: Loss) -> Curve:
+    """A fit's curve; measuring takes none of its time."""
+    passed, evaluations, seconds, losses, code = 0.0, 0, [], [], torch.empty(0)
+    for step in steps:
+        passed, evaluations, code = passed + step.seconds, evaluations + step.evaluations, step.code
+        if step.iteration % every == 0:
+            seconds.append(passed)
+            losses.append(loss(code))
+    return Curve(seconds, losses, evaluations, code)

@@ -1,0 +1,129 @@
+"""Results tables: how well a model knows its shapes, and how well shapes are completed from one sparse view."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+
+import numpy as np
+import torch
+import trimesh
+
+from distrace.benchmarks.measuring import poster_view
+from distrace.checkpoint import Model
+from distrace.data.samples import sample
+from distrace.data.shapes import Shape
+from distrace.data.solid import Solid, solid_of
+from distrace.data.view import observe, pictured
+from distrace.fitting.code_residuals import Comparison
+from distrace.fitting.consistent import completed
+from distrace.fitting.fit_code import fit_points
+from distrace.fitting.methods import METHODS, steps_of, told
+from distrace.fitting.staged import CodeFitConfig
+from distrace.losses import Weights
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.prior import prior_of
+from distrace.shading import Picture, grid
+
+OBSERVATION_SIZE = 256
+TOLD = 40_000  # distances that a held-out shape is told by, …
+TOLD_NEAR = 0.5  # … and how many of them are near the surface: the others tell where nothing is
+TOLD_FIT = CodeFitConfig(iterations=40, robust=0, compared=Comparison(Weights(code=1e-4)))
+
+
+@dataclass(frozen=True)
+class Result:
+    """A predicted surface beside the true one."""
+
+    shape: str
+    method: str
+    points: int  # observed; 0 for a training code
+    chamfer_to: float
+    chamfer_from: float
+    chamfer: float
+    seconds: float
+    mesh: trimesh.Trimesh
+    truth: trimesh.Trimesh
+
+    def row(self, model: str) -> dict[str, str | int | float]:
+        return {
+            "model": model,
+            "shape": self.shape,
+            "points": self.points,
+            "method": self.method,
+            "chamfer_to": round(self.chamfer_to, 4),
+            "chamfer_from": round(self.chamfer_from, 4),
+            "chamfer": round(self.chamfer, 4),
+            "seconds": round(self.seconds, 1),
+        }
+
+
+def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
+    """Each training shape as its code gives it, against the outer surface of its mesh."""
+    for shape in shapes:
+        if shape.name in model.shapes:
+            mesh = extract_mesh(model.field(model.code_of(shape.name)), MeshConfig(resolution))
+            yield compared(shape.name, "training code", 0, mesh, solid_of(shape, meshes).surface, 0.0)
+
+
+def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
+    """Each held-out shape as the code says it best: fitted to distances all around it."""
+    for shape in shapes:
+        yield best_told(model, shape.name, solid_of(shape, meshes), resolution)
+
+
+def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
+    """A solid as the model says it best."""
+    samples = torch.from_numpy(sample(solid, TOLD, seed=0, near=TOLD_NEAR))
+    steps = list(fit_points(model.decoder, samples, prior_of(model.codes), TOLD_FIT))
+    seconds = sum(step.seconds for step in steps)
+    mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution))
+    return compared(name, "all distances", 0, mesh, solid.surface, seconds)
+
+
+def completion_results(
+    model: Model, shapes: list[Shape], meshes: Path, points: int, config: CodeFitConfig, resolution: int
+) -> Iterator[Result]:
+    """Each held-out shape completed from `points` depths of one view, by each method."""
+    for shape in shapes:
+        solid = solid_of(shape, meshes)
+        view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
+        for method in METHODS:
+            seen = told(view, method)
+            steps = list(steps_of(model, seen, method, config))
+            mesh = completed(model.field(steps[-1].code), seen, MeshConfig(resolution))
+            yield compared(shape.name, method, points, mesh, solid.surface, sum(step.seconds for step in steps))
+
+
+def compared(
+    shape: str, method: str, points: int, mesh: trimesh.Trimesh, truth: trimesh.Trimesh, seconds: float
+) -> Result:
+    distance = chamfer(mesh, truth)
+    return Result(shape, method, points, distance.to, distance.from_, distance.sum, seconds, mesh, truth)
+
+
+def summary(results: list[Result]) -> dict[str, dict[str, float]]:
+    """Mean, median and worst Chamfer of each method."""
+    values = {
+        method: np.array([result.chamfer for result in results if result.method == method])
+        for method in dict.fromkeys(result.method for result in results)
+    }
+    return {
+        method: {"mean": float(chamfers.mean()), "median": float(np.median(chamfers)), "worst": float(chamfers.max())}
+        for method, chamfers in values.items()
+    }
+
+
+def picture_of(results: list[Result]) -> Picture:
+    """Each shape as a row: the true surface, then what each method made of it."""
+    rows = []
+    for _, group in groupby(results, key=lambda result: result.shape):
+        of_shape = list(group)
+        rows.append([drawn(mesh) for mesh in (of_shape[0].truth, *(result.mesh for result in of_shape))])
+    return grid(rows)
+
+
+def drawn(mesh: trimesh.Trimesh) -> Picture:
+    """A mesh as the poster's camera sees it."""
+    return pictured(Solid(mesh, mesh), poster_view(OBSERVATION_SIZE))

@@ -1,0 +1,29 @@
+"""Networks before any training, whose surface is about a sphere (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+
+import torch
+from torch import nn
+
+from distrace.decoder import Decoder, NetworkSpecs
+from distrace.field import SDF
+
+RADIUS = 0.6
+
+
+def ball(layers: int, width: int, device: torch.device | str = "cpu") -> SDF:
+    """The field of a network before any training."""
+    specs = NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=())
+    return ball_decoder(specs, RADIUS).to(device).field(torch.zeros(1, device=device))
+
+
+def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
+    """About the distance to a sphere before any training (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+    decoder = Decoder(specs)
+    generator = torch.Generator().manual_seed(0)
+    linears = [module for module in decoder.modules() if isinstance(module, nn.Linear)]
+    with torch.no_grad():
+        for linear in linears[:-1]:
+            linear.weight.normal_(0, (2 / linear.out_features) ** 0.5, generator=generator)
+            linear.bias.zero_()
+        linears[-1].weight.normal_((torch.pi / linears[-1].in_features) ** 0.5, 1e-5, generator=generator)
+        linears[-1].bias.fill_(-radius)
+    return decoder.requires_grad_(False)
