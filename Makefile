@@ -10,8 +10,8 @@ test: .venv/installed  ## each file in one process: what its tests share is made
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 check: .venv/installed  ## style and types
-	$(BIN)/ruff check src tests examples
-	$(BIN)/ruff format --check src tests examples
+	$(BIN)/ruff check src experiments tests examples
+	$(BIN)/ruff format --check src experiments tests examples
 	$(BIN)/pyright
 
 # The environment; made again only when what it is made from changes.

@@ -15,14 +15,15 @@ import trimesh
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.data.shapes import read_split
+from distrace.data.solid import solid_of
 from distrace.data.view import observe, save_view
 from distrace.metrics import POINTS, surface_points
-from experiments.tables.completion import OBSERVATION_SIZE, solid_of
 
+SIZE = 256
 split, name, meshes, out = sys.argv[1:5]
 (shape,) = (shape for shape in read_split(split) if shape.name == name)
 solid = solid_of(shape, Path(meshes))
-view = observe(solid, poster_view(OBSERVATION_SIZE))
+view = observe(solid, poster_view(SIZE))
 save_view(Path(out) / f"{name}.npz", replace(view, normal=view.normal.half()))
 points = surface_points(solid.surface, POINTS, seed=1).astype(np.float32)
 trimesh.PointCloud(points).export(Path(out) / f"{name}.ply")

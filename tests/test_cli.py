@@ -1,11 +1,8 @@
 """The command line: the files and keys that other people's scripts rely on, and one line for whatever goes wrong."""
 
 import json
-import pickle
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import av
@@ -19,22 +16,16 @@ from test_train import SPECS, of_sphere, spheres
 import distrace.cli
 import distrace.cli.train_samples
 import distrace.movie
-from distrace import metrics
 from distrace.benchmarks.analytic import NAMES
 from distrace.camera import Camera
 from distrace.checkpoint import load_model, save_experiment
 from distrace.cli import show
 from distrace.data.samples import write_samples
 from distrace.data.view import View, load_view, save_view
-from distrace.mesh import MeshConfig
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.training.config import TrainConfig
 from distrace.training.train import start, train
-from experiments.commands import depth as evaluate_depth
-from experiments.tables import completion as evaluate
-from experiments.tables import sparse_depth, training_choices
-from experiments.tables import spread as spread_table
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}
@@ -261,147 +252,6 @@ def test_train_samples_a_folder_of_meshes_first(run: Command, tmp_path: Path, mo
     assert result(tmp_path / "model")["steps"] == 5, "a longer run goes on from where the shorter one ended"
 
 
-@pytest.fixture(scope="module")
-def spheres_split(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """Balls: two that the model knows, one held out and one left out; and the folder of their meshes."""
-    folder = tmp_path_factory.mktemp("balls")
-    lines = ["name,split,design,turn,path,creator,licence,note"]
-    for name, split, note in (
-        ("sphere0", "train", ""),
-        ("sphere1", "train", ""),
-        ("held", "test", ""),
-        ("flat", "out", "it is flat"),
-    ):
-        trimesh.creation.icosphere(subdivisions=2).export(folder / f"{name}.ply")
-        lines.append(f"{name},{split},{name},0,{name}.ply,me,CC0-1.0,{note}")
-    (folder / "balls.csv").write_text("\n".join(lines) + "\n")
-    return folder / "balls.csv", folder
-
-
-def test_invent_writes_meshes_that_are_sampled_and_learnt_with_the_class(run: Command, tmp_path: Path) -> None:
-    meshes, samples = tmp_path / "meshes", tmp_path / "samples"
-    run("invent", "tables", "--count", "3", "--out", meshes)
-    assert result(meshes, "class", "meshes", "seed")["meshes"] == 3
-    assert names(meshes) == {"tables~1.ply", "tables~2.ply", "tables~3.ply", "preview.png", "result.json"}
-    first = (meshes / "tables~1.ply").read_bytes()
-    run("invent", "tables", "--count", "1", "--out", tmp_path / "fewer")
-    assert (tmp_path / "fewer" / "tables~1.ply").read_bytes() == first
-    run("sample", meshes, "--out", samples, "--count", "1000", "--workers", "1")
-    run(
-        "train",
-        samples,
-        "--split",
-        "tables",
-        "--out",
-        tmp_path / "model",
-        "--steps",
-        "2",
-        "--layers",
-        "2",
-        "--width",
-        "16",
-        "--code-length",
-        "4",
-    )
-    assert load_model(tmp_path / "model").shapes == ("tables~1", "tables~2", "tables~3")
-
-
-def test_evaluate_held_out_tells_a_model_all_distances(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    split, meshes = spheres_split
-    monkeypatch.setattr(evaluate, "TOLD", 4000)
-    monkeypatch.setattr(metrics, "POINTS", 2000)
-    where = ("--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
-    run("evaluate", "held-out", *where)
-    (row,) = result(tmp_path, "rows", "summary")["rows"]
-    assert (row["shape"], row["method"]) == ("held", "all distances")
-
-
-@pytest.fixture
-def small_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials of small views, in this process: others do not know that they are to be small."""
-    for module in (evaluate_depth, spread_table):
-        monkeypatch.setattr(
-            module, "each_done", lambda work, wanted, jobs: map(pickle.loads(pickle.dumps(work)), wanted)
-        )
-    monkeypatch.setattr(sparse_depth, "SIZE", 64)
-    monkeypatch.setattr(spread_table, "MeshConfig", partial(MeshConfig, 32))
-    monkeypatch.setattr(spread_table, "COMPLETIONS", 3)
-    monkeypatch.setattr(metrics, "POINTS", 2000)
-
-
-@pytest.fixture
-def depth_table(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, small_trials: None, tmp_path: Path
-) -> Callable[[str], None]:
-    split, meshes = spheres_split
-    where = ("--classes", split, "--models", model, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
-    return lambda name: run("evaluate", name, *where, "--methods", "points", "--views", 1, "--jobs", 1)
-
-
-def test_evaluate_sparse_depth_writes_a_table_and_goes_on(depth_table: Callable[[str], None], tmp_path: Path) -> None:
-    depth_table("sparse-depth")
-    facts = result(tmp_path, "rows", "ratios", "instances", "evaluations")
-    assert [row["density"] for row in facts["rows"]] == ["dense", "50%", "10%", "100", "50", "20"]
-    assert len(facts["instances"]) == 6
-    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")}
-    depth_table("sparse-depth")
-    assert {path: path.stat().st_mtime_ns for path in (tmp_path / "trials").rglob("*.json")} == before
-
-
-def test_evaluate_focal_also_looks_at_what_was_fitted_through_other_focal_lengths(
-    depth_table: Callable[[str], None], tmp_path: Path
-) -> None:
-    depth_table("focal")
-    facts = result(tmp_path, "rows", "tests")
-    assert [row["focal_ratio"] for row in facts["rows"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
-    assert [row["tested_at"] for row in facts["tests"]] == [0.5, 0.71, 1.0, 1.41, 2.0]
-    assert all(0 < row["iou_median"] <= 1 and row["depth_error_median"] < 0.5 for row in facts["tests"])
-
-
-@pytest.mark.usefixtures("small_trials")
-def test_evaluate_spread_correlates_spread_and_error(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
-) -> None:
-    split, meshes = spheres_split
-    run("evaluate", "spread", "--classes", split, "--models", model, "--meshes", meshes, "--jobs", 1, "--out", tmp_path)
-    (row,) = result(tmp_path, "rows", "median_correlation")["rows"]
-    assert -1 <= row["correlation"] <= 1
-
-
-def test_evaluate_splits_and_card_describe_what_a_model_was_trained_on(
-    model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
-) -> None:
-    split, meshes = spheres_split
-    run("evaluate", "splits", "--splits", split, "--meshes", meshes, "--out", tmp_path / "splits")
-    rows = result(tmp_path / "splits", "rows")["rows"]
-    assert {row["shape"] for row in rows} == {"sphere0", "sphere1", "held"}
-    assert all(row["chamfer"] < 5 for row in rows), "they are one shape"
-    run("evaluate", "card", "--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path / "card")
-    assert names(tmp_path / "card") == {"result.json", "walks.png", "shapes.png", "shapes.md"}
-    said = (tmp_path / "card" / "shapes.md").read_text(encoding="utf-8")
-    assert "| flat | left out: it is flat | me | CC0-1.0 |" in said
-    assert "| held | held out | me | CC0-1.0 |" in said
-
-
-def test_evaluate_choices_trains_small_networks(
-    spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    split, meshes = spheres_split
-    run("sample", meshes, "--split", split, "--variants", 1, "--count", 1500, "--workers", 1, "--out", tmp_path / "s")
-    monkeypatch.setattr(training_choices, "SPECS", SPECS)
-    monkeypatch.setattr(evaluate, "TOLD", 500)
-    monkeypatch.setattr(evaluate, "TOLD_FIT", replace(evaluate.TOLD_FIT, iterations=4))
-    monkeypatch.setattr(metrics, "POINTS", 500)
-    where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
-    run("evaluate", "choices", *where, "--others", tmp_path / "s", "--steps", 40, "--resolution", 24)
-    rows = result(tmp_path / "out", "rows")["rows"]
-    assert [row["codes"] for row in rows] == [2, 2, 4, 4, 4, 4, 4, 9, 9]
-    assert [row["steps"] for row in rows[-2:]] == [40, 40 * 9 // 4]
-    assert all(row["held_out_median"] > 0 for row in rows)
-
-
 def test_complete_in_a_few_iterations_still_ends_with_a_code(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:
@@ -506,10 +356,12 @@ def test_without_a_command_or_with_help_it_says_what_there_is(run: Command, caps
         run("--help")
     assert stopped.value.code == 0
     said = capsys.readouterr().out
-    assert all(name in said for name in ("demo", "render", "mesh", "complete", "train", "bench", "evaluate"))
+    assert all(name in said for name in ("demo", "render", "mesh", "complete", "train", "bench"))
 
 
-def one_line(run: Command, capsys: pytest.CaptureFixture, arguments: tuple, status: int = 2) -> str:
+def one_line(
+    run: Command, capsys: pytest.CaptureFixture, arguments: tuple, status: int = 2, program: str = "distrace"
+) -> str:
     """Runs what is to fail; its line on stderr."""
     capsys.readouterr()
     with pytest.raises(SystemExit) as stopped:
@@ -518,7 +370,7 @@ def one_line(run: Command, capsys: pytest.CaptureFixture, arguments: tuple, stat
     assert stopped.value.code == status
     assert "Traceback" not in said
     assert said.count("\n") == 1, said
-    assert said.startswith("distrace: ")
+    assert said.startswith(f"{program}: ")
     assert len(said) > 20
     assert "---- " not in said
     return said
@@ -552,9 +404,6 @@ def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
 BAD = [
     ("", "Missing subcommand Expected"),
     ("paint", "paint"),
-    ("invent lamps", "lamps"),
-    ("invent sofas --count 0", "--count 0 was given; at least one shape"),
-    ("invent sofas --count 1 --out {tmp}/text", "text is a file"),
     ("render", "MODEL"),
     ("render {tmp}/missing", "neither a folder nor a bundled model"),
     ("render {tmp}/text", "neither a folder nor a bundled model"),
@@ -588,7 +437,6 @@ BAD = [
     ("bench trace {model} --size 0", "0 × 0"),
     ("bench everything {model}", "trace"),
     ("bench trace", "bench trace was given no model"),
-    ("bench memory {model} sofas", "2 models"),
     ("bench views {model} {tmp}/missing", "neither a folder nor a bundled model"),
     ("bench views {model} --views 0", "--views 0"),
     ("bench views {model} --sizes 64 32", "--sizes 64 32"),
@@ -624,27 +472,6 @@ BAD = [
     ("pose {model} {view} --disturb nan", "both finite"),
     ("pose {model} {view} --disturb-focal inf", "both finite"),
     ("pose {model} {view} --code {tmp}/nan.npy", "it has values that are not finite"),
-    ("evaluate pose --model {model} --cameras 0", "--cameras 0"),
-    ("evaluate training --model {model} --split sofas --meshes {tmp}/missing", "no shape in common"),
-    ("evaluate training --model {model}", "there is no split"),
-    (
-        "evaluate completion --model {model} --split sofas --meshes {tmp}/missing",
-        "is missing; `distrace data furniture",
-    ),
-    ("evaluate completion --model {model} --split {tmp}/text", "lacks the columns"),
-    ("evaluate completion --model {model} --split {tmp}/missing", "there is no split"),
-    ("evaluate fame --model {model}", "fame"),
-    ("evaluate sparse-depth --views 5", "--views 5"),
-    ("evaluate sparse-depth --shapes 0", "--shapes 0"),
-    ("evaluate spread --jobs 0", "--jobs 0"),
-    ("evaluate spread --classes", "--classes names none"),
-    ("evaluate multiview", "no clips were given"),
-    ("evaluate noise --models {model}", "1 models"),
-    ("evaluate sparse-depth --classes {tmp}/missing", "there is no split"),
-    ("evaluate splits --splits {tmp}/missing", "there is no split"),
-    ("evaluate splits --meshes {tmp}/missing", "is missing; `distrace data furniture"),
-    ("evaluate card --model {tmp}/missing --split sofas", "neither a folder nor a bundled model"),
-    ("evaluate choices --samples {tmp}/missing", "holds no samples of chairs"),
     ("data furniture --from {tmp}/text", "text"),
     ("data furniture --from {tmp}/missing", "missing"),
     ("data chairs", "chairs"),

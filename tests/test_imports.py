@@ -25,7 +25,7 @@ ORDER = [
     *("trace", "pyramid", "tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photographs", "reconstruction"),
-    *("pages", "evaluation", "cli", "__main__"),
+    *("pages", "benchmarks", "cli", "__main__"),
 ]
 SHELL = set(ORDER[ORDER.index("pages") :])
 FILES = {path.relative_to(SOURCE).with_suffix("").as_posix(): path for path in SOURCE.rglob("*.py")}

@@ -40,7 +40,7 @@ class Train:
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: tuple[str, ...] = ()  # learn only the training shapes of these, their variants, and what was invented
+    split: tuple[Path, ...] = ()  # CSV files: learn only the training shapes of these, their variants, and what was invented
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by

@@ -8,7 +8,6 @@ import torch
 import trimesh
 
 from distrace.batch_field import BatchField
-from distrace.benchmarks.pages import solvers_page
 from distrace.camera import Camera
 from distrace.checkpoint import Model
 from distrace.data.view import View
@@ -16,6 +15,7 @@ from distrace.decoder import Decoder, NetworkSpecs
 from distrace.fitting.starts import Step
 from distrace.rays import meet_sphere
 from experiments.costs import solvers
+from experiments.costs.pages import solvers_page
 
 
 class Spheres(Decoder):

@@ -4,10 +4,10 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_depth
-from distrace.benchmarks.pages import fields_page
 from distrace.primitives import box, union
 from distrace.render import render
 from experiments.costs.fields import COUNT, FieldRow, field_rows, hard_fields
+from experiments.costs.pages import fields_page
 
 SOFA = union(box(torch.tensor([0.6, 0.15, 0.3])), box(torch.tensor([0.15, 0.5, 0.3])))
 NAMES = ["decoder × 2", "thin plate", "high frequencies", "gap of a pixel", "clamped"]

@@ -6,11 +6,11 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_distance
-from distrace.benchmarks.pages import growth_page
 from distrace.checkpoint import load_model
 from distrace.primitives import sphere
 from distrace.rays import meet_sphere
 from experiments.costs import growth
+from experiments.costs.pages import growth_page
 
 
 @pytest.fixture(autouse=True)
