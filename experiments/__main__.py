@@ -5,7 +5,7 @@ from experiments.commands.clip import Clip
 from experiments.commands.costs import Fields, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
 from experiments.commands.photographs import Photographs
-from experiments.commands.procedural import Invent
+from experiments.commands.procedural import Procedural
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
 from experiments.commands.training_data import Card, Choices, Splits
 
@@ -28,7 +28,7 @@ COMMANDS = {
     "choices": Choices,
     "card": Card,
     "clip": Clip,
-    "procedural": Invent,
+    "procedural": Procedural,
 }
 ABOUT = "Measure what distrace can do, and make what it is measured on. Results go to the folder --out."
 

@@ -13,28 +13,28 @@ from distrace.data.solid import Solid, normalised
 from distrace.data.view import pictured
 from distrace.files import written
 from distrace.shading import in_rows, save_png
-from experiments.procedural import invented
+from experiments.procedural import procedural_mesh
 
 PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
 
 
 @dataclass(frozen=True)
-class Invent:
+class Procedural:
     """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
 
     category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
     count: int = 240
-    out: Path | None = None  # by default out/invented-sofas and so on
+    out: Path | None = None  # by default out/procedural-sofas and so on
     seed: int = 0
 
     def run(self) -> None:
-        run = start(self.out or Path("out") / f"invented-{self.category}")
+        run = start(self.out or Path("out") / f"procedural-{self.category}")
         if self.count < 1:
             raise ValueError(f"--count {self.count} was given; at least one shape is needed")
         pictures = []
-        with progress("inventing", self.count) as bar:
+        with progress("shapes", self.count) as bar:
             for number in range(1, self.count + 1):
-                mesh = invented(self.category, np.random.default_rng([self.seed, number]))
+                mesh = procedural_mesh(self.category, np.random.default_rng([self.seed, number]))
                 with written(run.out / f"{self.category}~{number}.ply") as part:
                     mesh.export(part, file_type="ply")
                 if number <= PREVIEWED:

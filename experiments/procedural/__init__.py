@@ -15,7 +15,7 @@ from experiments.procedural.plane import plane
 from experiments.procedural.sofa import sofa
 from experiments.procedural.table import table
 
-INVENTORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
+GENERATORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
     "sofas": sofa,
     "chairs": chair,
     "tables": table,
@@ -23,13 +23,13 @@ INVENTORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
 }
 
 
-def invented(category: str, random: np.random.Generator) -> trimesh.Trimesh:
+def procedural_mesh(category: str, random: np.random.Generator) -> trimesh.Trimesh:
     """A closed surface in the orientation of its class: furniture in metres, aircraft in lengths of their fuselage.
 
-    Raises `ValueError` for a class that nothing is invented of.
+    Raises `ValueError` for a class that there is no generator for.
     """
-    if category not in INVENTORS:
-        raise ValueError(f"shapes of {category} cannot be invented; those of {', '.join(INVENTORS)} can")
-    hulls = [Manifold.hull_points(part) for part in INVENTORS[category](random)]
+    if category not in GENERATORS:
+        raise ValueError(f"shapes of {category} cannot be made; those of {', '.join(GENERATORS)} can")
+    hulls = [Manifold.hull_points(part) for part in GENERATORS[category](random)]
     mesh = Manifold.batch_boolean(hulls, OpType.Add).to_mesh64()
     return trimesh.Trimesh(mesh.vert_properties, mesh.tri_verts, process=False)

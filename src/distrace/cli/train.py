@@ -40,14 +40,16 @@ class Train:
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: tuple[Path, ...] = ()  # CSV files: learn only the training shapes of these, their variants, and what was invented
+    split: tuple[
+        Path, ...
+    ] = ()  # CSV files: learn only the training shapes of these, their variants and procedural shapes
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
     large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
     dwell: int | None = None  # 1; times a sample is drawn near places that --begin-with has on the wrong side
     keep: float | None = None  # 0; × as much as samples counts that --begin-with stays as it is between its shapes
-    variant_weight: float | None = None  # 0.5; how often a variant, or what was invented, is drawn, to once the others
+    variant_weight: float | None = None  # 0.5; how often a variant or a procedural shape is drawn, to once the others
     learning_rate: float | None = None  # 0.001; less where a model is learnt further
     samples_per_step: int | None = None  # 2,048
     layers: int | None = None  # 8

@@ -19,7 +19,7 @@ def sample_files(given: Path, out: Path, splits: Sequence[Path] = ()) -> list[Pa
     paths = sorted(folder.glob("*.npz"))
     if splits:
         learnt = {shape.name for split in splits for shape in read_split(split) if shape.split == "train"}
-        wanted = learnt.union(split.stem for split in splits)  # what was invented is called sofas~1
+        wanted = learnt.union(split.stem for split in splits)  # procedural shapes are called sofas~1
         paths = [path for path in paths if original(path.stem) in wanted]
     if not paths:
         what = "holds no samples (.npz) to learn" if folder.is_dir() else "is no folder of samples or meshes"
