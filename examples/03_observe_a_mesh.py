@@ -14,9 +14,9 @@ import numpy as np
 import trimesh
 
 from distrace.benchmarks.measuring import poster_view
+from distrace.data.observation import observe, save_view
 from distrace.data.shapes import read_split
 from distrace.data.solid import solid_of
-from distrace.data.view import observe, save_view
 from distrace.metrics import POINTS, surface_points
 
 SIZE = 256

@@ -19,7 +19,7 @@ import torch
 from PIL import Image, ImageDraw
 
 import distrace as dt
-from distrace.primitives import box, intersection
+from distrace.fields.primitives import box, intersection
 from distrace.shading import Picture, save_png, shaded_picture, side_by_side
 
 CAUTIOUS = dt.TraceConfig(steps=200, step_scale=1.0, coarse_levels=0)  # slopes reach 2.2: longer steps would not settle

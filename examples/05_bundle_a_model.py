@@ -12,7 +12,7 @@ import torch
 
 import distrace as dt
 from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoint import save_model
+from distrace.checkpoints.model import save_model
 from distrace.metrics import depth_errors, iou
 
 experiment, out = (Path(argument) for argument in sys.argv[1:3])

@@ -12,10 +12,10 @@ from torch import Tensor
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photographs import Photograph, Placement, load_photographs
-from distrace.primitives import sphere
+from distrace.fields.primitives import sphere
 from distrace.rays import meet_sphere
 from distrace.render import render
-from distrace.trace import TraceConfig
+from distrace.tracing.sphere_tracing import TraceConfig
 
 EXACT = TraceConfig(coarse_levels=0, tolerance=1e-5, steps=200)  # of few pixels several times as fast as `fast`
 WORLD = Placement(torch.tensor([2.0, -3.0, 40.0], dtype=torch.float64), 5.0)

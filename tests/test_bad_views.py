@@ -8,7 +8,7 @@ import torch
 
 from distrace.camera import Camera
 from distrace.data import arrays as reading
-from distrace.data.view import load_view, read_view, save_view
+from distrace.data.observation import load_view, read_view, save_view
 from distrace.rays import meet_sphere
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=32, width=40, focal_px=40.0)

@@ -10,10 +10,10 @@ from torch import Tensor
 from distrace.benchmarks.ablation import COUNT, NAIVE_RAYS, of_field, of_model
 from distrace.benchmarks.measuring import LONG, Case, Row, in_turn, measure, poster_view, reference_distance
 from distrace.camera import Camera
-from distrace.checkpoint import Model
-from distrace.decoder import Decoder, NetworkSpecs
-from distrace.field import SDF, Counted
-from distrace.primitives import box, capsule, sphere, union
+from distrace.checkpoints.model import Model
+from distrace.fields.base import SDF, Counted
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.primitives import box, capsule, sphere, union
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import STRATEGIES, Buffers, render
 

@@ -8,13 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace import primitives
 from distrace.boundary import shade
 from distrace.camera import Camera
-from distrace.checkpoint import load_model
-from distrace.field import SDF, Counted
+from distrace.checkpoints.model import load_model
+from distrace.fields import primitives
+from distrace.fields.base import SDF, Counted
 from distrace.render import Buffers, render, render_rays
-from distrace.trace import TraceConfig
+from distrace.tracing.sphere_tracing import TraceConfig
 
 f64 = torch.float64
 WHITE = torch.ones(1, dtype=f64)

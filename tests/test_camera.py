@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from distrace.camera import Camera
 from distrace.rays import Bounds, Rays, meet_sphere
-from distrace.trace import Trace
+from distrace.tracing.sphere_tracing import Trace
 
 f64 = torch.float64
 orbits = st.builds(

@@ -16,8 +16,8 @@ import safetensors.torch
 import torch
 from test_decoder import arrays, deepsdf, randomised
 
-from distrace.checkpoint import Model, bundled_models, load_model, save_experiment, save_model
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.checkpoints.model import Model, bundled_models, load_model, save_experiment, save_model
+from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.files import written
 
 torch.set_num_threads(1)
@@ -183,7 +183,7 @@ def test_a_code_that_the_model_has_not_is_named(tmp_path):
 
 def test_a_name_that_is_nothing_lists_the_bundled_models(tmp_path, monkeypatch):
     save_model(tmp_path / "lamps", load_model(experiment(tmp_path / "experiment")))
-    monkeypatch.setattr("distrace.checkpoint.BUNDLED", tmp_path)
+    monkeypatch.setattr("distrace.checkpoints.model.BUNDLED", tmp_path)
     assert bundled_models() == ["experiment", "lamps"]
     assert refused("no-such-name") == "no-such-name is neither a folder nor a bundled model (experiment, lamps)"
     assert load_model("lamps").name == "lamps"

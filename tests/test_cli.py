@@ -18,14 +18,14 @@ import distrace.cli.train_samples
 import distrace.movie
 from distrace.benchmarks.analytic import NAMES
 from distrace.camera import Camera
-from distrace.checkpoint import load_model, save_experiment
+from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import show
+from distrace.data.observation import View, load_view, save_view
 from distrace.data.samples import write_samples
-from distrace.data.view import View, load_view, save_view
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.training.config import TrainConfig
-from distrace.training.train import start, train
+from distrace.training.trainer import start, train
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}
@@ -486,7 +486,7 @@ BAD = [
     ("reconstruct {tmp}/good --save-every -1", "--save-every -1.0 was given"),
     ("train {tmp}/good --layers 0", "--layers 0 --width 512 were given"),
     ("train {tmp}/samples", "is not a file of samples"),
-    ("train {tmp}/good --split sofas", "holds no samples"),
+    ("train {tmp}/good --split sofas", "there is no split sofas; give a CSV file"),
     ("train {tmp}/good --out {tmp}/stopped", "is not a checkpoint of a training run"),
     ("train {tmp}/good --wrong-sign 0", "wrong sign 0 times"),
     ("train {tmp}/good --large -1", "above -1 squared"),

@@ -14,7 +14,7 @@ import distrace.cli.gradients
 from distrace.benchmarks.derivatives import COUNT
 from distrace.benchmarks.untrained import ball
 from distrace.checking.gradcheck import GradientCheck, GradientRow, check_gradients
-from distrace.checkpoint import save_experiment
+from distrace.checkpoints.model import save_experiment
 
 VIEW = ("--distance", "3", "--focal-mm", "40", "--size", "10")
 COMMON = {"seconds", "device", "version", "evaluations", "rows", "command", "machine"}

@@ -6,9 +6,9 @@ import pytest
 import torch
 from test_train import CONFIG, SPECS, spheres
 
-from distrace.training import train as training
+from distrace.training import trainer as training
 from distrace.training.config import TrainConfig
-from distrace.training.train import start, train
+from distrace.training.trainer import start, train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 

@@ -9,8 +9,8 @@ import torch
 from torch.func import functional_call
 
 from distrace.benchmarks.measuring import Operations
-from distrace.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.field import chunked
+from distrace.fields.base import chunked
+from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 
 torch.set_num_threads(1)
 
@@ -127,8 +127,8 @@ def test_more_points_than_a_chunk_are_as_good_as_few(monkeypatch, points):
     decoder = randomised(PLAIN)
     code = a_code(decoder)
     whole = decoder.field(code)(points)
-    monkeypatch.setattr("distrace.decoder.CHUNK", 7)
-    monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
+    monkeypatch.setattr("distrace.fields.decoder.CHUNK", 7)
+    monkeypatch.setattr("distrace.fields.decoder.RECORDED_CHUNK", 7)
     torch.testing.assert_close(decoder.field(code)(points), whole)
     with torch.no_grad():
         torch.testing.assert_close(decoder.field(code)(points), whole)
@@ -231,7 +231,7 @@ def test_a_narrowed_field_may_be_narrowed_again(points):
 
 def test_points_of_many_chunks_are_narrowed_together(monkeypatch, points):
     decoder, _ = wide()
-    monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
+    monkeypatch.setattr("distrace.fields.decoder.RECORDED_CHUNK", 7)
     field = decoder.field(a_code(decoder))
     values, narrow = field.narrowed(a_place(points))
     torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
@@ -318,8 +318,8 @@ def test_chunks_of_a_selection_change_nothing(monkeypatch, points, recorded):
     field = decoder.field(a_code(decoder, 3)).select(a_selection(len(points), 3))
     with torch.set_grad_enabled(recorded):
         whole = field(points)
-        monkeypatch.setattr("distrace.decoder.CHUNK", 7)
-        monkeypatch.setattr("distrace.decoder.RECORDED_CHUNK", 7)
+        monkeypatch.setattr("distrace.fields.decoder.CHUNK", 7)
+        monkeypatch.setattr("distrace.fields.decoder.RECORDED_CHUNK", 7)
         torch.testing.assert_close(field(points), whole)
 
 

@@ -11,19 +11,19 @@ from test_train import finished, spheres
 
 import distrace.cli.console
 from distrace.camera import Camera
-from distrace.checkpoint import load_model, save_experiment
+from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import _run, multiview, pose
+from distrace.data.observation import View
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, save_photographs
 from distrace.data.placement import Placement
-from distrace.data.view import View
 from distrace.fitting import methods
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_samples import SampleFitConfig
 from distrace.fitting.methods import CLOUDS, METHODS, steps_of, told
-from distrace.fitting.staged import CodeFitConfig
-from distrace.pages import views_page
 from distrace.render import render
+from distrace.report import views_page
 from distrace.training.config import TrainConfig
 
 Command = Callable[..., None]

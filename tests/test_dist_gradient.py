@@ -6,9 +6,9 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checking.dist_gradient import attach_dist, march
-from distrace.primitives import sphere
+from distrace.fields.primitives import sphere
 from distrace.rays import Rays, meet_sphere
-from distrace.trace import AGGRESSIVE, sphere_trace
+from distrace.tracing.sphere_tracing import AGGRESSIVE, sphere_trace
 
 f64 = torch.float64
 FACING = Rays(torch.tensor([[0.0, 0, 5]], dtype=f64), torch.tensor([[0.0, 0, -1]], dtype=f64))

@@ -5,12 +5,12 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distrace import primitives
 from distrace.camera import Camera
-from distrace.field import Counted, chunked, narrowed, placed, value_and_gradient
+from distrace.fields import primitives
+from distrace.fields.base import Counted, chunked, narrowed, placed, value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.render import render
-from distrace.trace import TraceConfig
+from distrace.tracing.sphere_tracing import TraceConfig
 
 WRONG = {
     "column": lambda p: p[..., :1],

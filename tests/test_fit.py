@@ -10,13 +10,13 @@ from torch import Tensor
 
 from distrace import losses
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.data.observation import View
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.primitives import sphere
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples
-from distrace.fitting.starts import Step
-from distrace.fitting.targets import OUTLINE, Pool, Targets
-from distrace.primitives import sphere
+from distrace.fitting.multistart import Step
+from distrace.fitting.ray_sampling import OUTLINE, Pool, Targets
 from distrace.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render

@@ -8,16 +8,16 @@ import torch
 from photographed import EXACT
 from torch import Tensor
 
-from distrace import primitives
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.field import SDF
+from distrace.data.observation import View
+from distrace.fields import primitives
+from distrace.fields.base import SDF
 from distrace.fitting.alignment import Accuracy, Still, residuals
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
-from distrace.fitting.sight import Sight, outline_of, rays_of
+from distrace.fitting.visibility import Sight, outline_of, rays_of
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render, render_rays
-from distrace.trace import DYNAMIC
+from distrace.tracing.sphere_tracing import DYNAMIC
 
 f64 = torch.float64
 BALL = primitives.sphere(0.5, torch.tensor([0.1, 0.05, -0.1], dtype=f64))

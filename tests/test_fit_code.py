@@ -10,21 +10,21 @@ import pytest
 import torch
 from bumpy import bumpy_balls
 
-from distrace import quickest
-from distrace.batch_field import BatchField
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.decoder import FAR, Decoder
-from distrace.fitting.by_code import derivatives
+from distrace.data.observation import View
+from distrace.fields import precision
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import FAR, Decoder
+from distrace.fitting.code_jacobian import derivatives
 from distrace.fitting.code_residuals import Comparison, Look, Problem
+from distrace.fitting.continuation import CodeFitConfig, fitted, stage_of
 from distrace.fitting.fit_code import fit_code, fit_points
-from distrace.fitting.nearest import Hints, first_of
+from distrace.fitting.multistart import Step, stages_of
+from distrace.fitting.observations import Seen
 from distrace.fitting.point_residuals import PointProblem, misfits
-from distrace.fitting.seen import Seen
+from distrace.fitting.ray_sampling import Pool
+from distrace.fitting.retrieval import Hints, first_of
 from distrace.fitting.solver import Residuals, SolverConfig, cauchy, minimise
-from distrace.fitting.staged import CodeFitConfig, fitted, stage_of
-from distrace.fitting.starts import Step, stages_of
-from distrace.fitting.targets import Pool
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.render import render
@@ -52,7 +52,7 @@ def view(decoder: Decoder) -> View:
 @pytest.fixture
 def exact_products(monkeypatch: pytest.MonkeyPatch) -> None:
     """As on a processor without products in bfloat16, by which rays that graze are seen otherwise."""
-    monkeypatch.setattr(quickest, "_multiplies_in_bfloat16", lambda: False)
+    monkeypatch.setattr(precision, "_multiplies_in_bfloat16", lambda: False)
 
 
 def last(steps: Iterator[Step]) -> Step:
@@ -62,7 +62,7 @@ def last(steps: Iterator[Step]) -> Step:
 
 def problem_of(decoder: Decoder, view: View, compared: Comparison) -> Problem:
     targets = Pool.of(view).draw(200, 200, torch.Generator().manual_seed(0))
-    return Problem(quickest.quickest(decoder), PRIOR, Seen.of([targets], compared.weights), compared)
+    return Problem(precision.fastest(decoder), PRIOR, Seen.of([targets], compared.weights), compared)
 
 
 def looked(problem: Problem, w: torch.Tensor, last: Look | None = None) -> Look:
@@ -308,7 +308,7 @@ def test_the_solver_lowers_its_loss(decoder: Decoder, view: View) -> None:
 @pytest.fixture(params=[False, True], ids=["float32", "bfloat16"])
 def either_precision(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
     """On a processor without and with products in bfloat16, whatever this one is."""
-    monkeypatch.setattr(quickest, "_multiplies_in_bfloat16", lambda: request.param)
+    monkeypatch.setattr(precision, "_multiplies_in_bfloat16", lambda: request.param)
     return request.param
 
 

@@ -13,15 +13,15 @@ from torch.nn import functional as F
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
-from distrace.decoder import Decoder
-from distrace.photographs.choice import contradictions
-from distrace.photographs.doubtful import agreements
-from distrace.photographs.fit_photos import PhotoConfig, fit_photos
-from distrace.photographs.pairs import Colours, partners, without_light
-from distrace.photographs.regions import Regions, appearance
-from distrace.photographs.residuals import PhotoProblem, Shape
-from distrace.photographs.search import Search
-from distrace.photographs.stage import Comparing, Stage
+from distrace.fields.decoder import Decoder
+from distrace.photos.colour_segmentation import Regions, appearance
+from distrace.photos.fit_photos import PhotoConfig, fit_photos
+from distrace.photos.initialisation import Search
+from distrace.photos.model_selection import contradictions
+from distrace.photos.outlier_views import agreements
+from distrace.photos.residuals import PhotoProblem, Shape
+from distrace.photos.stage import Comparing, Stage
+from distrace.photos.stereo_pairs import Colours, partners, without_light
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import meet_sphere

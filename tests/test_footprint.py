@@ -5,14 +5,15 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace import losses, primitives, surface
+from distrace import losses, surface
 from distrace.boundary import shade
 from distrace.camera import Camera
-from distrace.checkpoint import load_model
-from distrace.decoder import Decoder
-from distrace.field import SDF, Counted
+from distrace.checkpoints.model import load_model
+from distrace.fields import primitives
+from distrace.fields.base import SDF, Counted
+from distrace.fields.decoder import Decoder
 from distrace.render import FOOTPRINT, WIDEST, Buffers, render, render_rays
-from distrace.trace import DYNAMIC
+from distrace.tracing.sphere_tracing import DYNAMIC
 
 f64 = torch.float64
 LIGHT = normalize(torch.tensor([0.4, 0.8, 0.45]), dim=-1)

@@ -6,15 +6,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from distrace import primitives
 from distrace.camera import Camera
 from distrace.checking.differences import derivatives, differences
 from distrace.checking.footprints import Footprints
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, check_gradients, compare
 from distrace.checking.moves import all_moves, decoder_changes, in_double, own_changes
 from distrace.checking.retrace import DOUBLE, SINGLE, Retraced, least_beside, zero_beside
-from distrace.checkpoint import load_model
-from distrace.decoder import Decoder, NetworkSpecs
+from distrace.checkpoints.model import load_model
+from distrace.fields import primitives
+from distrace.fields.decoder import Decoder, NetworkSpecs
 
 CAMERA = Camera.orbit(30, 20, 4.97, height=16, width=16)
 VIEW = Camera.orbit(30, 20, 4.97, height=48, width=48, dtype=torch.float64)

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace import primitives
 from distrace.benchmarks.derivatives import COUNT, QUERIES, RatioRow, ratio_rows, subjects
 from distrace.benchmarks.untrained import ball
 from distrace.camera import Camera
@@ -16,8 +15,9 @@ from distrace.checking.differences import Images, derivatives
 from distrace.checking.gradcheck import check_gradients
 from distrace.checking.moves import Move, all_moves
 from distrace.checking.retrace import DOUBLE, Retraced
-from distrace.checkpoint import Model
-from distrace.field import SDF
+from distrace.checkpoints.model import Model
+from distrace.fields import primitives
+from distrace.fields.base import SDF
 
 f64 = torch.float64
 RADIUS, CENTRE = 0.5, torch.tensor([0.1, -0.05, 0.2], dtype=f64)

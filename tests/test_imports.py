@@ -8,26 +8,13 @@ import pytest
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
     *("threads", "errors", "files", "processes", "equality", "pixels", "rays", "viewpoint", "camera", "pose"),
-    *(
-        "field",
-        "batch_field",
-        "products",
-        "steepness",
-        "primitives",
-        "decoder",
-        "rounded",
-        "laid_out",
-        "quickest",
-        "experiment",
-        "checkpoint",
-        "prior",
-    ),
-    *("trace", "pyramid", "tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
+    *("fields", "checkpoints", "prior"),
+    *("tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
-    *("training", "fitting", "photographs", "reconstruction"),
-    *("pages", "benchmarks", "cli", "__main__"),
+    *("training", "fitting", "photos", "reconstruction"),
+    *("report", "benchmarks", "cli", "__main__"),
 ]
-SHELL = set(ORDER[ORDER.index("pages") :])
+SHELL = set(ORDER[ORDER.index("report") :])
 FILES = {path.relative_to(SOURCE).with_suffix("").as_posix(): path for path in SOURCE.rglob("*.py")}
 TREES = {name: ast.parse(path.read_text(encoding="utf-8")) for name, path in FILES.items()}
 PARTS = sorted({name.split("/")[0] for name in TREES} - {"__init__"})

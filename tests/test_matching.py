@@ -9,11 +9,11 @@ from test_fit_photos import ring
 from torch.nn import functional as F
 
 from distrace.data.photograph import Photograph
-from distrace.fitting.targets import band
-from distrace.primitives import sphere
+from distrace.fields.primitives import sphere
+from distrace.fitting.ray_sampling import band
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruction.matching import ACROSS, Matching, correlation
-from distrace.trace import sphere_trace
+from distrace.tracing.sphere_tracing import sphere_trace
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,9 @@ import pytest
 import torch
 from skimage.measure import marching_cubes
 
-from distrace import primitives
 from distrace.errors import DoubtfulResult
-from distrace.field import SDF
+from distrace.fields import primitives
+from distrace.fields.base import SDF
 from distrace.mesh import MeshConfig, extract_mesh
 
 COARSE = MeshConfig(resolution=48)

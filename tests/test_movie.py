@@ -11,9 +11,9 @@ from PIL import Image, ImageSequence
 
 from distrace import movie
 from distrace.camera import Camera
-from distrace.field import Counted
+from distrace.fields.base import Counted
+from distrace.fields.primitives import box, sphere
 from distrace.movie import filmed, save_gif, save_mp4, turntable
-from distrace.primitives import box, sphere
 from distrace.render import STRATEGIES, render
 
 SAVERS = {"mp4": save_mp4, "gif": save_gif}

@@ -13,10 +13,10 @@ from test_fit_photos import GREY, TRUE, paint, ring
 
 from distrace.boundary import shade
 from distrace.camera import Camera
-from distrace.checkpoint import Model, save_model
+from distrace.checkpoints.model import Model, save_model
 from distrace.cli import main
 from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
-from distrace.photographs.fit_photos import KNOWN_PLACE
+from distrace.photos.fit_photos import KNOWN_PLACE
 from distrace.render import render
 
 
@@ -44,7 +44,7 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     save_views(tmp_path / "views", ring(6, 40))
     monkeypatch.setattr("distrace.cli.multiview.KNOWN_PLACE", replace(KNOWN_PLACE, iterations=2, levels=(0.5, 1.0)))
     for name in ("SHOWN", "FRAMES"):
-        monkeypatch.setattr(f"distrace.pages.views_page.{name}", 2)
+        monkeypatch.setattr(f"distrace.report.views_page.{name}", 2)
     out = tmp_path / "out"
     given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed"]
     given += ["--starts", "1", "--rays", "500", "--resolution", "40"]

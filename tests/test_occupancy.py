@@ -5,10 +5,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool3d
 
-from distrace import primitives
 from distrace.camera import Camera
-from distrace.checkpoint import load_model
-from distrace.field import SDF, Counted
+from distrace.checkpoints.model import load_model
+from distrace.fields import primitives
+from distrace.fields.base import SDF, Counted
 from distrace.rays import meet_sphere
 from distrace.render import render
 from distrace.tracing.bounds import Occupancy, find_occupancy

@@ -9,8 +9,8 @@ import torch
 from photographed import POINT, WORLD, ball, in_world
 
 from distrace.camera import Camera
-from distrace.data.carving import within_masks
 from distrace.data.placement import Placement, among_points, between_axes, nearest_to_rays
+from distrace.data.space_carving import within_masks
 
 RING = [Camera.orbit(40 * k, 20 * (k % 3) - 10, 4.0, height=48, width=64, focal_px=64.0) for k in range(9)]
 

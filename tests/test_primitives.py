@@ -7,9 +7,9 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from distrace import primitives
-from distrace.field import SDF, value_and_gradient
-from distrace.primitives import _length
+from distrace.fields import primitives
+from distrace.fields.base import SDF, value_and_gradient
+from distrace.fields.primitives import _length
 
 f64 = torch.float64
 

@@ -14,12 +14,12 @@ from distrace.benchmarks.agreement_page import agreement_page, described, pictur
 from distrace.benchmarks.measuring import reference_depth, reference_distance
 from distrace.benchmarks.random_views import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
 from distrace.camera import Camera
-from distrace.checkpoint import Model, load_model
-from distrace.decoder import Decoder, NetworkSpecs
-from distrace.primitives import box, difference, sphere, union
+from distrace.checkpoints.model import Model, load_model
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.primitives import box, difference, sphere, union
 from distrace.rays import Rays, meet_sphere
 from distrace.render import STRATEGIES, render
-from distrace.trace import DYNAMIC
+from distrace.tracing.sphere_tracing import DYNAMIC
 
 SIZES = (16, 32)
 SHOT = Shot(azimuth=20.0, elevation=10.0, distance=3.0, focal_mm=40.0, target=(0.0, 0.0, 0.0), size=64)

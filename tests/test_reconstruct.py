@@ -22,19 +22,18 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.cli import main
 from distrace.cli.reconstruct import parted, without
-from distrace.data.dark import masked
+from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
-from distrace.field import SDF, value_and_gradient
-from distrace.pages.reconstruction_page import judged
-from distrace.photographs.agreed_depths import NO_DEPTHS
-from distrace.photographs.hull import overlaps, visual_hull
-from distrace.primitives import box, sphere, torus
+from distrace.fields.base import SDF, value_and_gradient
+from distrace.fields.primitives import box, sphere, torus
+from distrace.photos.multiview_depth import NO_DEPTHS
+from distrace.photos.visual_hull import overlaps, visual_hull
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruction.beginning import begin
+from distrace.reconstruction.camera_refinement import between, drift, motions, moved, relative
 from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
+from distrace.reconstruction.initialisation import begin
 from distrace.reconstruction.matching import Matching
-from distrace.reconstruction.motions import between, drift, motions, moved, relative
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.registration import registered
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
@@ -47,8 +46,9 @@ from distrace.reconstruction.surface_network import (
 )
 from distrace.reconstruction.terms import MARCH, Pool, coloured, terms_of
 from distrace.render import render
+from distrace.report.reconstruction_page import judged
 from distrace.surface import attach
-from distrace.trace import sphere_trace
+from distrace.tracing.sphere_tracing import sphere_trace
 
 BLACK = torch.zeros(3)
 CPU = torch.device("cpu")
@@ -228,7 +228,7 @@ def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reco
 @pytest.fixture
 def coarse_hull(monkeypatch: pytest.MonkeyPatch) -> None:
     """In an eighth of the time: the object is coarse, too."""
-    monkeypatch.setattr("distrace.photographs.hull.CELLS", 80)
+    monkeypatch.setattr("distrace.photos.visual_hull.CELLS", 80)
 
 
 @pytest.mark.usefixtures("coarse_hull")

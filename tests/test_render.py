@@ -6,11 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from distrace import primitives
 from distrace.camera import Camera
+from distrace.fields import primitives
 from distrace.rays import meet_sphere
 from distrace.render import STRATEGIES, Buffers, Config, render, render_rays
-from distrace.trace import COARSE_TO_FINE, DYNAMIC, Outcome
+from distrace.tracing.sphere_tracing import COARSE_TO_FINE, DYNAMIC, Outcome
 from distrace.tracing.tracer import TracerConfig
 
 f64 = torch.float64

@@ -15,12 +15,12 @@ import trimesh
 from PIL import Image
 
 from distrace.camera import Camera
+from distrace.fields.primitives import sphere
 from distrace.metrics import Chamfer
-from distrace.pages import charts, scene
-from distrace.pages import page as html
-from distrace.pages.report import Completion, View, completion_page
-from distrace.primitives import sphere
 from distrace.render import render
+from distrace.report import charts, scene
+from distrace.report import page as html
+from distrace.report.completion_page import Completion, View, completion_page
 
 VOID = {"meta", "link", "img", "br", "path", "use"}
 

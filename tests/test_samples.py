@@ -10,11 +10,11 @@ import pytest
 import torch
 import trimesh
 
-from distrace import primitives
 from distrace.data import sampling
 from distrace.data.samples import THIN, Doubt, doubt, lost, sample, write_samples
 from distrace.data.shapes import Shape, every_mesh, read_split
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, normalised_frame
+from distrace.fields import primitives
 from distrace.training.batches import load_samples
 
 CUBE = RADIUS / math.sqrt(3) * 2  # the edge of a normalised cube

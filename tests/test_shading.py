@@ -9,7 +9,7 @@ from PIL import Image
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.primitives import sphere
+from distrace.fields.primitives import sphere
 from distrace.render import Buffers, render
 
 CENTRE, CORNER = (24, 24), (0, 0)

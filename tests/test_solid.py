@@ -8,8 +8,8 @@ import pytest
 import torch
 import trimesh
 
-from distrace import primitives
 from distrace.data.solid import RADIUS, SMALLEST, Solid, load_solid, turned
+from distrace.fields import primitives
 
 SHIFT = np.array([0.5, 0.3, 0.2])  # of the second of two unit cubes
 MIDDLE = SHIFT / 2

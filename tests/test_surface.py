@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace import primitives, surface
+from distrace import surface
 from distrace.camera import Camera
+from distrace.fields import primitives
 from distrace.rays import Rays, meet_sphere
-from distrace.trace import AGGRESSIVE, TraceConfig, sphere_trace
+from distrace.tracing.sphere_tracing import AGGRESSIVE, TraceConfig, sphere_trace
 
 f64 = torch.float64
 EXACT = TraceConfig(steps=500, step_scale=1.0, tolerance=1e-9, coarse_levels=0)

@@ -8,19 +8,19 @@ import torch
 from bumpy import bumpy_balls
 from torch import Tensor
 
-from distrace import primitives
-from distrace.batch_field import CountedBatch
 from distrace.benchmarks.measuring import Operations, poster_view, recorded, reference_distance
 from distrace.camera import Camera
-from distrace.checkpoint import load_model
+from distrace.checkpoints.model import load_model
 from distrace.errors import DoubtfulResult
-from distrace.field import SDF, Counted
+from distrace.fields import primitives
+from distrace.fields.base import SDF, Counted
+from distrace.fields.batch import CountedBatch
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render
-from distrace.trace import Outcome
 from distrace.tracing.evaluator import ROUGH_ERROR, Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import march_cones
+from distrace.tracing.sphere_tracing import Outcome
 from distrace.tracing.tracer import TracerConfig, trace_rays
 
 f64 = torch.float64

@@ -19,18 +19,18 @@ from test_solvers import Spheres
 from torch import Tensor
 
 import distrace.cli.train
-from distrace.checkpoint import Model, load_model, save_experiment, save_model
+from distrace.checkpoints.model import Model, load_model, save_experiment, save_model
 from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
-from distrace.decoder import NetworkSpecs
+from distrace.fields.decoder import NetworkSpecs
 from distrace.files import alone
 from distrace.training.batches import Samples, load_samples
+from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.kept import Kept
+from distrace.training.distillation import Kept
+from distrace.training.hard_samples import CERTAIN, REACH, dwelling
 from distrace.training.losses import training_loss
-from distrace.training.resume import NAME, load_training, save_training
-from distrace.training.train import Step, Training, begin_with, bound_codes, start, train
-from distrace.training.wrong_places import CERTAIN, REACH, dwelling
+from distrace.training.trainer import Step, Training, begin_with, bound_codes, start, train
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
@@ -486,6 +486,6 @@ def test_what_is_learnt_of_several_splits_is_what_any_of_them_trains_on(tmp_path
     samples.mkdir()
     for name in ("a", "a~warped1", "b", "c", "d", "e"):
         (samples / f"{name}.npz").touch()
-    splits = [str(tmp_path / f"{name}.csv") for name in ("jets", "parked")]
+    splits = [tmp_path / f"{name}.csv" for name in ("jets", "parked")]
     assert [path.stem for path in train_samples.sample_files(samples, tmp_path, splits)] == ["a", "a~warped1", "c"]
     assert len(train_samples.sample_files(samples, tmp_path)) == 6

@@ -5,18 +5,18 @@ from dataclasses import replace
 import pytest
 import torch
 
-from distrace.batch_field import BatchField
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.field import SDF
+from distrace.data.observation import View
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
+from distrace.fields.primitives import sphere
 from distrace.fitting.code_residuals import Comparison
-from distrace.fitting.seen import Seen
-from distrace.fitting.targets import Pool
+from distrace.fitting.observations import Seen
+from distrace.fitting.ray_sampling import Pool
 from distrace.fitting.verdict import MOST, contradictions
 from distrace.losses import Weights
-from distrace.primitives import sphere
 from distrace.render import render
-from distrace.trace import TraceConfig
+from distrace.tracing.sphere_tracing import TraceConfig
 
 CAMERA = Camera.orbit(30, 20, 3.0, height=48, width=48, focal_px=60.0)
 TRACE = Comparison().trace

@@ -19,7 +19,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.errors import explained
-from distrace.photographs.pairs import partners
+from distrace.photos.stereo_pairs import partners
 
 PARTNERS = 2  # of each view
 LARGER = 2  # times: matches are found to about a sixteenth of a pixel only where images are smooth

@@ -9,8 +9,8 @@ import tyro
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.cli.console import progress, start
+from distrace.data.observation import pictured
 from distrace.data.solid import Solid, normalised
-from distrace.data.view import pictured
 from distrace.files import written
 from distrace.shading import in_rows, save_png
 from experiments.procedural import procedural_mesh

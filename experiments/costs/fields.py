@@ -9,10 +9,10 @@ from torch import Tensor
 from distrace.benchmarks.hard_fields import hard_fields
 from distrace.benchmarks.measuring import OUTLIER, reference_depth
 from distrace.camera import Camera
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.metrics import depth_errors
 from distrace.render import STRATEGIES, render
-from distrace.trace import Outcome
+from distrace.tracing.sphere_tracing import Outcome
 
 COUNT = 5 * len(STRATEGIES)  # of rows
 

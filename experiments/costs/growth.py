@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from distrace.batch_field import BatchField
 from distrace.benchmarks.measuring import Operations, in_turn, poster_view, recorded
 from distrace.benchmarks.untrained import ball
 from distrace.camera import Camera
-from distrace.checkpoint import Model, load_model
-from distrace.field import SDF
+from distrace.checkpoints.model import Model, load_model
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.movie import turntable
 from distrace.render import STRATEGIES, Buffers, render
 

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 
 from distrace.benchmarks.pages import cells
-from distrace.pages.charts import courses, growth
-from distrace.pages.page import Html, page, section, table
+from distrace.report.charts import courses, growth
+from distrace.report.page import Html, page, section, table
 from experiments.costs.fields import FieldRow
 from experiments.costs.growth import GrowthRow
 from experiments.costs.solvers import Curve, SolverRow

@@ -10,16 +10,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
+from distrace.data.observation import View, observe
 from distrace.data.shapes import Shape
 from distrace.data.solid import solid_of
-from distrace.data.view import View, observe
 from distrace.fitting.code_residuals import Comparison
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
 from distrace.fitting.fit_code import fit_code
-from distrace.fitting.staged import CodeFitConfig
-from distrace.fitting.starts import Step
-from distrace.fitting.targets import Pool
+from distrace.fitting.multistart import Step
+from distrace.fitting.ray_sampling import Pool
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.prior import Prior, prior_of

@@ -7,7 +7,7 @@ from jaxtyping import Bool
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from distrace.data.view import View
+from distrace.data.observation import View
 
 SIZE = 2.0  # of an object: the diameter of the unit sphere
 STEP = 0.02  # of quantised depths, as a part of SIZE

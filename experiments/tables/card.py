@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
+from distrace.data.observation import pictured
 from distrace.data.shapes import Shape
 from distrace.data.solid import solid_of
-from distrace.data.view import pictured
-from distrace.pages.report import View
 from distrace.render import render
+from distrace.report.completion_page import View
 from distrace.shading import Picture, grid, in_rows, side_by_side
 
 TILE = 128  # pixels

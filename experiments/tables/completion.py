@@ -10,16 +10,16 @@ import torch
 import trimesh
 
 from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
+from distrace.data.observation import observe, pictured
 from distrace.data.samples import sample
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, solid_of
-from distrace.data.view import observe, pictured
 from distrace.fitting.code_residuals import Comparison
-from distrace.fitting.consistent import completed
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit_code import fit_points
+from distrace.fitting.free_space import completed
 from distrace.fitting.methods import METHODS, steps_of, told
-from distrace.fitting.staged import CodeFitConfig
 from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer

@@ -6,7 +6,7 @@ from statistics import median
 
 import torch
 
-from distrace.data.view import observe
+from distrace.data.observation import observe
 from distrace.metrics import depth_errors, iou
 from distrace.render import render
 from experiments.tables.sparse_depth import RATIOS, Trial, camera_of, done, true_solid

@@ -19,19 +19,19 @@ import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
+from distrace.data.observation import View
 from distrace.data.photographs import Photograph, load_photographs
 from distrace.data.pictures import read_mask
-from distrace.data.view import View
 from distrace.errors import explained
 from distrace.files import save_json, written
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit_code import fit_code
-from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
-from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
-from distrace.photographs.search import Search
-from distrace.photographs.stage import Stage
+from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
+from distrace.photos.initialisation import Search
+from distrace.photos.stage import Stage
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from experiments.baselines.semi_global import stereo_points

@@ -10,14 +10,14 @@ import roma
 import torch
 
 from distrace.camera import Camera
-from distrace.data.view import View
+from distrace.data.observation import View
 from distrace.errors import explained
 from distrace.files import save_json
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
-from distrace.pages.charts import steps_chart
-from distrace.pages.page import page, paragraph, section, short, table
 from distrace.pose import object_in_camera, pose_error, turned_object, with_object_at, zoomed
 from distrace.render import render
+from distrace.report.charts import steps_chart
+from distrace.report.page import page, paragraph, section, short, table
 from experiments.tables.trials import opened_once
 
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST

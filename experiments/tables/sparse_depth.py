@@ -16,13 +16,13 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
+from distrace.data.observation import View, observe
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, solid_of
-from distrace.data.view import View, observe
 from distrace.files import save_json
-from distrace.fitting.consistent import completed
+from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.free_space import completed
 from distrace.fitting.methods import settings_of, steps_of, told
-from distrace.fitting.staged import CodeFitConfig
 from distrace.metrics import chamfer
 from experiments.datasets.noise import NOISES, noisy
 from experiments.datasets.splits import on_side, shape_of

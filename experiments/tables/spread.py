@@ -9,12 +9,12 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
+from distrace.data.observation import observe
 from distrace.data.shapes import Shape
-from distrace.data.view import observe
-from distrace.fitting.consistent import completed
+from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.free_space import completed
 from distrace.fitting.methods import completing
-from distrace.fitting.plausible import plausible, spread
-from distrace.fitting.staged import CodeFitConfig
+from distrace.fitting.posterior import plausible, spread
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
 from distrace.processes import each_done

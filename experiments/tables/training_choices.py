@@ -7,11 +7,11 @@ from statistics import mean, median
 
 import torch
 
-from distrace.checkpoint import Model
-from distrace.decoder import NetworkSpecs
+from distrace.checkpoints.model import Model
+from distrace.fields.decoder import NetworkSpecs
 from distrace.training.batches import load_samples
 from distrace.training.config import TrainConfig
-from distrace.training.train import faster_in_bfloat16, start, train
+from distrace.training.trainer import faster_in_bfloat16, start, train
 from experiments.datasets.splits import on_side
 from experiments.tables.completion import held_out_results, training_results
 

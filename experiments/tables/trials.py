@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.checkpoint import Model, load_model
+from distrace.checkpoints.model import Model, load_model
 from distrace.errors import explained
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.mesh import MeshConfig
 
 Result = TypeVar("Result")

@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace import surface
-from distrace.field import SDF, at_rows, value_and_gradient
+from distrace.fields.base import SDF, at_rows, value_and_gradient
 from distrace.rays import Bounds, Rays
 from distrace.render import Buffers
 

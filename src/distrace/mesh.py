@@ -12,8 +12,8 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 
 from distrace.errors import DoubtfulResult
-from distrace.field import SDF, asked, chunked, narrowed
-from distrace.steepness import steep, typical_slope
+from distrace.fields.base import SDF, asked, chunked, narrowed
+from distrace.fields.lipschitz import steep, typical_slope
 
 AT_ONCE = 1 << 16  # points, of a field that does not limit them itself
 MOST = 2048  # cells along an axis: 32 GiB of values

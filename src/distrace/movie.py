@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from distrace.camera import Camera
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.files import written
 from distrace.render import Buffers, Config, render
 from distrace.shading import Picture

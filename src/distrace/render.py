@@ -12,14 +12,15 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from distrace import pyramid, surface
-from distrace.batch_field import BatchField
+from distrace import surface
 from distrace.camera import Camera
 from distrace.errors import DoubtfulResult
-from distrace.field import SDF
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.rays import Rays, meet_sphere
-from distrace.trace import MARCHES, Outcome, Trace, TraceConfig, sphere_trace
+from distrace.tracing import coarse_to_fine as pyramid
 from distrace.tracing.bounds import Occupancy
+from distrace.tracing.sphere_tracing import MARCHES, Outcome, Trace, TraceConfig, sphere_trace
 from distrace.tracing.tracer import TracerConfig, trace_images
 
 FOOTPRINT = 10.0  # pixels: with narrower ones the derivatives of a ReLU network's normals are off by more than 10 %

@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 from torch.utils.checkpoint import checkpoint
 
-from distrace.field import SDF, at_rows, value_and_gradient
+from distrace.fields.base import SDF, at_rows, value_and_gradient
 from distrace.rays import Bounds, Rays
 
 LEAST_SLOPE = 1e-6  # a ray along the surface has no derivative of its distance

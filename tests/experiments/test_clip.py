@@ -14,10 +14,10 @@ from PIL import Image
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
-import distrace.cli
 from distrace.camera import Camera
+from distrace.data.observation import observe
 from distrace.data.solid import Solid, load_solid, load_soup, turned
-from distrace.data.view import observe
+from experiments.__main__ import main
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.clutter import NEAREST, boxes, sky
 from experiments.clips.patches import Patch, has_images, load_patches, painted, placed
@@ -70,8 +70,8 @@ def world(tmp_path: Path) -> Path:
 def run(monkeypatch: pytest.MonkeyPatch, world: Path) -> Command:
     def command(*arguments: object) -> None:
         common = ["--split", world / "things.csv", "--meshes", world / "meshes", "--out", world / "clip"]
-        monkeypatch.setattr(sys, "argv", ["distrace", "clip", *map(str, [*arguments, *common])])
-        distrace.cli.main()
+        monkeypatch.setattr(sys, "argv", ["experiments", "clip", *map(str, [*arguments, *common])])
+        main()
 
     return command
 

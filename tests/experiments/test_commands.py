@@ -14,7 +14,7 @@ from test_cli import run as run_distrace
 from test_train import SPECS
 
 from distrace import metrics
-from distrace.checkpoint import load_model
+from distrace.checkpoints.model import load_model
 from distrace.mesh import MeshConfig
 from experiments.__main__ import main
 from experiments.commands import depth

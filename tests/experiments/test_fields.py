@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_depth
-from distrace.primitives import box, union
+from distrace.fields.primitives import box, union
 from distrace.render import render
 from experiments.costs.fields import COUNT, FieldRow, field_rows, hard_fields
 from experiments.costs.pages import fields_page

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_distance
-from distrace.checkpoint import load_model
-from distrace.primitives import sphere
+from distrace.benchmarks.untrained import RADIUS, ball
+from distrace.checkpoints.model import load_model
+from distrace.fields.primitives import sphere
 from distrace.rays import meet_sphere
 from experiments.costs import growth
 from experiments.costs.pages import growth_page
@@ -57,7 +58,7 @@ def test_many_shapes_in_one_call_are_measured_beside_their_evaluations(monkeypat
 def test_an_untrained_network_is_about_a_sphere(layers: int, width: int) -> None:
     rays = poster_view(16).rays()
     with torch.no_grad():
-        found = reference_distance(growth.ball(layers, width), rays, meet_sphere(rays))
+        found = reference_distance(ball(layers, width), rays, meet_sphere(rays))
     hit = torch.isfinite(found)
     assert hit.sum() > 10
-    assert rays.at(found)[hit].norm(dim=-1).mean() == pytest.approx(growth.RADIUS, rel=0.5)
+    assert rays.at(found)[hit].norm(dim=-1).mean() == pytest.approx(RADIUS, rel=0.5)

@@ -6,8 +6,8 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
+from distrace.data.observation import View, observe
 from distrace.data.solid import Solid
-from distrace.data.view import View, observe
 from experiments.datasets.noise import NOISES, SIZE, STEP, noisy
 
 CAMERA = Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=96, width=96)

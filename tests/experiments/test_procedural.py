@@ -9,6 +9,7 @@ import trimesh
 from manifold3d import Manifold, OpType
 
 from distrace.cli.train_samples import sample_files
+from experiments.datasets.splits import FOLDER
 from experiments.procedural import GENERATORS, procedural_mesh
 from experiments.procedural.foot import foot
 from experiments.procedural.parts import Part, block, bowed, disc, rod, row, sheet, tilted
@@ -150,5 +151,5 @@ def test_what_leans_backwards_has_its_top_behind() -> None:
 def test_a_split_is_learnt_with_its_procedural_shapes(tmp_path: Path) -> None:
     for name in ("armchair-cc0", "armchair-cc0~warped1", "cafe-chair", "chairs~1", "sofas~1"):
         (tmp_path / f"{name}.npz").touch()
-    names = [path.stem for path in sample_files(tmp_path, tmp_path, ["chairs"])]
+    names = [path.stem for path in sample_files(tmp_path, tmp_path, [FOLDER / "chairs.csv"])]
     assert names == ["armchair-cc0", "armchair-cc0~warped1", "chairs~1"]  # cafe-chair is held out

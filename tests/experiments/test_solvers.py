@@ -7,12 +7,12 @@ import pytest
 import torch
 import trimesh
 
-from distrace.batch_field import BatchField
 from distrace.camera import Camera
-from distrace.checkpoint import Model
-from distrace.data.view import View
-from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fitting.starts import Step
+from distrace.checkpoints.model import Model
+from distrace.data.observation import View
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fitting.multistart import Step
 from distrace.rays import meet_sphere
 from experiments.costs import solvers
 from experiments.costs.pages import solvers_page

@@ -10,9 +10,9 @@ import torch
 import trimesh
 from pretended import DEVICE, pretended
 
-from distrace.checkpoint import Model, save_model
-from distrace.decoder import Decoder, NetworkSpecs
-from distrace.fitting.staged import CodeFitConfig
+from distrace.checkpoints.model import Model, save_model
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.rays import meet_sphere

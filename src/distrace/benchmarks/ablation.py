@@ -8,11 +8,11 @@ from torch import Tensor
 
 from distrace.benchmarks.measuring import Case, reference_depth
 from distrace.camera import Camera
-from distrace.checkpoint import Model
-from distrace.field import SDF
+from distrace.checkpoints.model import Model
+from distrace.fields.base import SDF
 from distrace.rays import Bounds, meet_sphere
 from distrace.render import STRATEGIES, Buffers, Config, render
-from distrace.trace import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
+from distrace.tracing.sphere_tracing import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
 
 NAIVE_RAYS = 100  # of which the row `naive` is a sample
 ORIGINAL_BATCH = 100_000  # points

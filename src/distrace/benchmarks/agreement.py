@@ -23,7 +23,7 @@ from distrace.benchmarks.random_views import Mixture, Shot, View
 from distrace.files import save_arrays
 from distrace.metrics import depth_errors, iou
 from distrace.render import Buffers, Config, render
-from distrace.trace import Outcome
+from distrace.tracing.sphere_tracing import Outcome
 
 LEAST_IOU = 0.995  # of a view …
 SMALL, WRONG = 1600, 8  # … but an object of fewer pixels may have so many wrong ones instead

@@ -20,8 +20,8 @@ from distrace.benchmarks.agreement import (
     ViewRow,
 )
 from distrace.benchmarks.random_views import Mixture
-from distrace.pages.page import figure, key, page, paragraph, row, section, short, table
-from distrace.pages.report import View as Rendered
+from distrace.report.completion_page import View as Rendered
+from distrace.report.page import figure, key, page, paragraph, row, section, short, table
 from distrace.shading import Picture
 
 SIDE = 256  # pixels; smaller pictures are enlarged towards it

@@ -13,10 +13,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace import primitives
 from distrace.benchmarks.hard_fields import hard_fields
 from distrace.benchmarks.random_views import SENSOR_MM, Shot, View, aimed, draw_shot
-from distrace.field import SDF, placed
+from distrace.fields import primitives
+from distrace.fields.base import SDF, placed
 
 SATURATIONS = (1, 10, 15, 30)  # k of tanh(k f)
 WIDTHS = (1, 2, 3)  # pixels

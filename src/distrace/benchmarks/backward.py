@@ -8,8 +8,8 @@ from statistics import median
 import torch
 
 from distrace.camera import Camera
-from distrace.checkpoint import Model
-from distrace.field import SDF
+from distrace.checkpoints.model import Model
+from distrace.fields.base import SDF
 from distrace.render import render
 
 

@@ -15,9 +15,9 @@ from distrace.checking.dist_gradient import Queries, attach_dist, march
 from distrace.checking.gradcheck import Compared, compare
 from distrace.checking.moves import Change, Move, Tally, all_moves, decoder_changes
 from distrace.checking.retrace import DOUBLE, Retraced
-from distrace.checkpoint import Model
-from distrace.field import SDF
-from distrace.primitives import box, sphere
+from distrace.checkpoints.model import Model
+from distrace.fields.base import SDF
+from distrace.fields.primitives import box, sphere
 from distrace.rays import meet_sphere
 from distrace.render import Buffers
 

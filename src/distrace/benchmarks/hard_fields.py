@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.field import SDF
-from distrace.primitives import box, sphere
+from distrace.fields.base import SDF
+from distrace.fields.primitives import box, sphere
 
 CLAMP = 0.02
 THICKNESS = 0.004

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace.camera import Camera
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.metrics import depth_errors, iou
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers

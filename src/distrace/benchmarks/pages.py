@@ -10,10 +10,10 @@ from distrace import shading
 from distrace.benchmarks.backward import Timing
 from distrace.benchmarks.derivatives import RatioRow
 from distrace.benchmarks.measuring import Row
-from distrace.pages.charts import bars
-from distrace.pages.page import Html, figure, page, paragraph, ramp, section, short, table
-from distrace.pages.page import row as beside
 from distrace.render import Buffers
+from distrace.report.charts import bars
+from distrace.report.page import Html, figure, page, paragraph, ramp, section, short, table
+from distrace.report.page import row as beside
 from distrace.shading import Picture
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checkpoint import Model
-from distrace.field import SDF, value_and_gradient
+from distrace.checkpoints.model import Model
+from distrace.fields.base import SDF, value_and_gradient
 
 SENSOR_MM = 32.0
 DISTANCES = (1.6, 12.0)  # of the eye from the origin, in radii

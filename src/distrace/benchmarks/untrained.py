@@ -3,8 +3,8 @@
 import torch
 from torch import nn
 
-from distrace.decoder import Decoder, NetworkSpecs
-from distrace.field import SDF
+from distrace.fields.base import SDF
+from distrace.fields.decoder import Decoder, NetworkSpecs
 
 RADIUS = 0.6
 

@@ -6,9 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.rays import Bounds, Rays
-from distrace.trace import AGGRESSIVE, TraceConfig
+from distrace.tracing.sphere_tracing import AGGRESSIVE, TraceConfig
 
 
 @dataclass(frozen=True)

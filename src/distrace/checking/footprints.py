@@ -10,7 +10,7 @@ from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives, differences
 from distrace.checking.moves import Move
 from distrace.checking.retrace import Retraced, zero_beside
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.pixels import thinned
 from distrace.render import Buffers
 

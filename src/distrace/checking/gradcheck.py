@@ -13,7 +13,7 @@ from distrace.checking.differences import Images, derivatives, differences
 from distrace.checking.footprints import Footprints
 from distrace.checking.moves import Change, Move, Tally, all_moves, in_double, own_changes
 from distrace.checking.retrace import DOUBLE, SINGLE, Precision, Retraced
-from distrace.field import SDF
+from distrace.fields.base import SDF
 
 STRAY = 0.01  # of what is compared: so much may be off, on kinks of ReLU networks that one-sided differences miss
 SMALL = 0.1  # of the median derivative: smaller ones are measured against that

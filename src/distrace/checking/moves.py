@@ -14,8 +14,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from distrace.camera import Camera
-from distrace.decoder import Decoder, ShapeField
-from distrace.field import SDF, Counted, chunked, placed
+from distrace.fields.base import SDF, Counted, chunked, placed
+from distrace.fields.decoder import Decoder, ShapeField
 
 AXES = "xyz"
 Change = Callable[[Tensor], SDF]

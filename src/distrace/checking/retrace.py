@@ -9,11 +9,11 @@ from torch import Tensor
 from distrace import surface
 from distrace.camera import Camera
 from distrace.checking.differences import Images
-from distrace.field import SDF, value_and_gradient
+from distrace.fields.base import SDF, value_and_gradient
 from distrace.pixels import thinned
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers
-from distrace.trace import Outcome, Trace, TraceConfig, sphere_trace
+from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig, sphere_trace
 
 CAREFUL = TraceConfig(steps=300, step_scale=1.0, coarse_levels=0)
 CHORDS = 3

@@ -9,7 +9,7 @@ import tyro
 
 from distrace.benchmarks import ablation, backward, derivatives, pages
 from distrace.benchmarks.measuring import measure, poster_view
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.common import Flag, opened, show_table
 from distrace.cli.console import Run, origin, progress, start

@@ -8,7 +8,7 @@ from distrace.benchmarks import analytic
 from distrace.benchmarks.agreement import Measured, badness, measure_view, summaries
 from distrace.benchmarks.agreement_page import agreement_page, worst_picture
 from distrace.benchmarks.random_views import View, model_views
-from distrace.checkpoint import Model, bundled_models, load_model
+from distrace.checkpoints.model import Model, bundled_models, load_model
 from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, console, origin, progress
 from distrace.files import save_text

@@ -11,12 +11,12 @@ import tyro
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoint import Model, load_model
+from distrace.checkpoints.model import Model, load_model
 from distrace.cli.console import console
 from distrace.files import save_arrays, written
-from distrace.pages.page import short
-from distrace.pages.report import View
 from distrace.render import Buffers
+from distrace.report.completion_page import View
+from distrace.report.page import short
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Views = Annotated[

@@ -13,10 +13,10 @@ from distrace.cli.common import ModelName, opened
 from distrace.cli.completion import Surface, Task, complete
 from distrace.cli.console import console, start
 from distrace.data.cloud import Cloud, load_cloud
-from distrace.data.view import View, load_view
+from distrace.data.observation import View, load_view
 from distrace.errors import explained
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
-from distrace.fitting.staged import CodeFitConfig
 from distrace.mesh import MeshConfig
 
 OBSERVATIONS = files("distrace") / "observations"

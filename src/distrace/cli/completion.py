@@ -10,23 +10,23 @@ import trimesh
 from distrace import shading
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
 from distrace.cli.common import save_mesh
 from distrace.cli.console import Run, console, progress
 from distrace.data.cloud import Cloud
-from distrace.data.view import View
+from distrace.data.observation import View
 from distrace.files import written
-from distrace.fitting.consistent import LEFT_OUT, completed
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
+from distrace.fitting.free_space import LEFT_OUT, completed
 from distrace.fitting.methods import completing
-from distrace.fitting.plausible import plausible, spread
-from distrace.fitting.staged import CodeFitConfig
-from distrace.fitting.starts import Step
+from distrace.fitting.multistart import Step
+from distrace.fitting.posterior import plausible, spread
 from distrace.mesh import MeshConfig
 from distrace.metrics import Chamfer, chamfer
-from distrace.pages import report
 from distrace.prior import prior_of
 from distrace.render import render
+from distrace.report import completion_page as report
 
 Surface = trimesh.Trimesh | np.ndarray
 CLOUD_SIZE = 256  # pixels of the pictures of a cloud's completion

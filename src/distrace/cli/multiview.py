@@ -9,19 +9,19 @@ import torch
 import trimesh
 import tyro
 
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, ModelName, Views, opened, save_mesh
 from distrace.cli.console import console, progress, start
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
-from distrace.pages.views_page import forming, views_page
-from distrace.photographs.doubtful import Agreement, agreements
-from distrace.photographs.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
-from distrace.photographs.residuals import Shape
-from distrace.photographs.stage import Comparing
+from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
+from distrace.photos.outlier_views import Agreement, agreements
+from distrace.photos.residuals import Shape
+from distrace.photos.stage import Comparing
 from distrace.prior import prior_of
+from distrace.report.views_page import forming, views_page
 
 
 @dataclass(frozen=True)

@@ -10,12 +10,12 @@ import tyro
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, ModelName, opened
 from distrace.cli.console import Run, console, progress, start
-from distrace.data.view import View, read_view, save_view
+from distrace.data.observation import View, read_view, save_view
 from distrace.errors import explained
-from distrace.field import SDF
+from distrace.fields.base import SDF
 from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render

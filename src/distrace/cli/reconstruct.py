@@ -10,18 +10,18 @@ import tyro
 from distrace.cli.common import Every, Flag, Views
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
-from distrace.data.dark import masked
+from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
 from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
-from distrace.pages.reconstruction_page import judged
-from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths
-from distrace.photographs.hull import Overlap, overlaps, visual_hull
-from distrace.reconstruction.beginning import begin, telling
+from distrace.photos.multiview_depth import NO_DEPTHS, AgreedDepths
+from distrace.photos.visual_hull import Overlap, overlaps, visual_hull
+from distrace.reconstruction.initialisation import begin, telling
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
 from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
 from distrace.reconstruction.surface_network import SurfaceSpecs
+from distrace.report.reconstruction_page import judged
 from distrace.shading import save_png
 
 PREVIEWS = 40  # of a run, evenly over its steps; they make its film

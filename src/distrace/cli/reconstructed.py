@@ -18,10 +18,10 @@ from distrace.data.placement import Placement
 from distrace.files import save_text
 from distrace.mesh import MeshConfig
 from distrace.movie import save_gif
-from distrace.pages.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
-from distrace.reconstruction.motions import between, drift, motions, moved, relative
+from distrace.reconstruction.camera_refinement import between, drift, motions, moved, relative
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction.registration import registered
+from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
 TOLD = 4  # views that were fitted to, on the page

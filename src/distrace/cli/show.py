@@ -12,15 +12,15 @@ import tyro
 from distrace.camera import Camera
 from distrace.cli.common import Flag, ModelName, opened, orbiting, save_buffers, save_mesh, save_pictures
 from distrace.cli.console import console, progress, start
-from distrace.data.view import View as Observation
-from distrace.data.view import save_view
-from distrace.field import Counted
+from distrace.data.observation import View as Observation
+from distrace.data.observation import save_view
+from distrace.fields.base import Counted
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
-from distrace.pages.report import View
 from distrace.render import STRATEGIES, Buffers, Config
+from distrace.report.completion_page import View
 from distrace.shading import Picture
-from distrace.trace import Outcome, Trace, TraceConfig
+from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig
 
 
 @dataclass(frozen=True)

@@ -9,25 +9,25 @@ import torch
 import tyro
 
 from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoint import Model, save_experiment
+from distrace.checkpoints.model import Model, save_experiment
 from distrace.cli.common import Every, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
-from distrace.decoder import NetworkSpecs
+from distrace.fields.decoder import NetworkSpecs
 from distrace.files import alone
-from distrace.pages.charts import save_course
-from distrace.pages.report import View
 from distrace.render import render
+from distrace.report.charts import save_course
+from distrace.report.completion_page import View
 from distrace.shading import save_png, side_by_side
 from distrace.training.batches import Samples, load_samples
+from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.course import COURSE
-from distrace.training.kept import Kept
-from distrace.training.resume import load_training, save_training
-from distrace.training.train import Training, begin_with, faster_in_bfloat16
-from distrace.training.train import start as start_training
-from distrace.training.train import train as run_training
-from distrace.training.wrong_places import dwelling
+from distrace.training.distillation import Kept
+from distrace.training.hard_samples import dwelling
+from distrace.training.loss_history import COURSE
+from distrace.training.trainer import Training, begin_with, faster_in_bfloat16
+from distrace.training.trainer import start as start_training
+from distrace.training.trainer import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
 TRIED = 20  # steps that tell how many fit into --minutes
@@ -40,9 +40,7 @@ class Train:
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: tuple[
-        Path, ...
-    ] = ()  # CSV files: learn only the training shapes of these, their variants and procedural shapes
+    split: tuple[Path, ...] = ()  # CSV files: learn only their training shapes and variants of these
     minutes: float | None = None  # as many steps as fit, at the speed of the first ones
     steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
     wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by

@@ -4,7 +4,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from distrace.checkpoint import original
+from distrace.checkpoints.model import original
 from distrace.cli.data import sampled
 from distrace.data import sampling
 from distrace.data.shapes import every_mesh, has_meshes, read_split

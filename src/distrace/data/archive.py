@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, BinaryIO
 
-from ..errors import explained
+from distrace.errors import explained
 
 LIMIT = 4 << 30  # bytes
 

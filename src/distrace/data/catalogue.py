@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import explained
-from .debian import fetch
+from distrace.data.debian import fetch
+from distrace.errors import explained
 
 COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import ALMOST
-from distrace.data.view import View
+from distrace.data.observation import View
 from distrace.errors import about, explained
 
 

@@ -6,8 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from ..errors import explained
-from .archive import unpack_deb
+from distrace.data.archive import unpack_deb
+from distrace.errors import explained
 
 _STAMP = "unpacked-from.txt"
 DOCUMENTS = "usr/share/doc"

@@ -4,10 +4,10 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from .archive import unpack_zip
-from .catalogue import Mesh, listed
-from .debian import by_hand, unpacked
-from .properties import properties
+from distrace.data.archive import unpack_zip
+from distrace.data.catalogue import Mesh, listed
+from distrace.data.debian import by_hand, unpacked
+from distrace.data.properties import properties
 
 PACKAGE = "sweethome3d-furniture"
 CATEGORIES = {

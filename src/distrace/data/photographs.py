@@ -10,14 +10,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.carving import within_masks
 from distrace.data.checks import check_intrinsics
-from distrace.data.layouts import colmap, idr, middlebury, own, transforms
-from distrace.data.layouts.shots import Shot, Shots, inside
+from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
+from distrace.data.photo_readers.frames import Shot, Shots, inside
 from distrace.data.photograph import Photograph as Photograph
 from distrace.data.pictures import read_mask, read_picture, save_mask, save_picture
 from distrace.data.placement import Placement as Placement
 from distrace.data.placement import among_points, between_axes
+from distrace.data.space_carving import within_masks
 from distrace.errors import about
 from distrace.files import save_json
 

@@ -7,8 +7,8 @@ import re
 import shutil
 from pathlib import Path
 
-from .catalogue import Mesh, listed
-from .debian import by_hand, unpacked
+from distrace.data.catalogue import Mesh, listed
+from distrace.data.debian import by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"

@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from distrace.data.augmentation import lopsided, warped
 from distrace.data.samples import Doubt, doubt, sample, write_samples
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, load_solid, turned
-from distrace.data.warp import lopsided, warped
 from distrace.errors import explained
 from distrace.files import save_json
 from distrace.processes import each_done

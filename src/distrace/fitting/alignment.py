@@ -8,14 +8,14 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace.camera import Camera
-from distrace.field import SDF, value_and_gradient
-from distrace.fitting.sight import Sight
+from distrace.fields.base import SDF, value_and_gradient
 from distrace.fitting.solver import Residuals
+from distrace.fitting.visibility import Sight
 from distrace.pose import object_in_camera
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
-from distrace.trace import Trace
 from distrace.tracing.bounds import Occupancy
+from distrace.tracing.sphere_tracing import Trace
 from distrace.tracing.tracer import TracerConfig, trace_rays
 
 APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller

@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.field import value_and_gradient
+from distrace.data.observation import View
+from distrace.fields.base import value_and_gradient
 from distrace.fitting.alignment import Still
 from distrace.fitting.solver import Residuals
 from distrace.pose import turned_object

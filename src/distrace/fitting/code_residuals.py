@@ -8,18 +8,18 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from distrace.batch_field import CountedBatch
-from distrace.decoder import Decoder
-from distrace.field import SDF
-from distrace.fitting.by_code import derivatives, with_prior
-from distrace.fitting.seen import Seen
+from distrace.fields.base import SDF
+from distrace.fields.batch import CountedBatch
+from distrace.fields.decoder import Decoder
+from distrace.fields.precision import BFloat16Decoder
+from distrace.fitting.code_jacobian import derivatives, with_prior
+from distrace.fitting.observations import Seen
 from distrace.fitting.solver import Residuals
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.rays import Bounds
-from distrace.rounded import Rounded
 from distrace.surface import minimum_and_value
-from distrace.trace import TraceConfig, sphere_trace
+from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 BACK = 0.03  # before where it ended last a ray is taken up again: what a step brings farther before is seen later
 ATTENTION = 0.025  # rays of the background that come closer than this are searched for their least value …
@@ -74,7 +74,7 @@ class Problem:
     do not depend on the others.
     """
 
-    decoder: Decoder | Rounded  # rounded where that is faster; residuals are not
+    decoder: Decoder | BFloat16Decoder  # rounded where that is faster; residuals are not
     prior: Prior
     seen: Seen
     config: Comparison

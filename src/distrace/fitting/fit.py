@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 
 from distrace import losses
-from distrace.data.view import View
-from distrace.decoder import Decoder
-from distrace.field import SDF, Counted
-from distrace.fitting.starts import Starts, Step, best_of
-from distrace.fitting.targets import Pool, Targets
+from distrace.data.observation import View
+from distrace.fields.base import SDF, Counted
+from distrace.fields.decoder import Decoder
+from distrace.fitting.multistart import Starts, Step, best_of
+from distrace.fitting.ray_sampling import Pool, Targets
 from distrace.losses import Weights
 from distrace.prior import Prior
 from distrace.render import render_rays
-from distrace.trace import TraceConfig
+from distrace.tracing.sphere_tracing import TraceConfig
 
 
 @dataclass(frozen=True)

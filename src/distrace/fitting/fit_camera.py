@@ -9,12 +9,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.view import View
-from distrace.field import SDF, Counted
+from distrace.data.observation import View
+from distrace.fields.base import SDF, Counted
 from distrace.fitting.alignment import Accuracy, Still, residuals
 from distrace.fitting.blurred import Blurred
-from distrace.fitting.sight import Sight, outline_of, rays_of
 from distrace.fitting.solver import Residuals, Solution, SolverConfig, minimise
+from distrace.fitting.visibility import Sight, outline_of, rays_of
 from distrace.pose import aimed, pose_error, turned_object, zoomed
 from distrace.rays import meet_sphere
 

@@ -11,23 +11,22 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.batch_field import CountedBatch
-from distrace.data.view import View
-from distrace.decoder import FAR, Decoder
+from distrace.data.observation import View
+from distrace.fields.batch import CountedBatch
+from distrace.fields.decoder import FAR, Decoder
+from distrace.fields.precision import BFloat16Decoder, fastest
 from distrace.fitting.code_residuals import Problem
+from distrace.fitting.continuation import CodeFitConfig, ProblemOf, fitted, stage_of
 from distrace.fitting.fit import pools_of
-from distrace.fitting.nearest import DEPTHS, SILHOUETTE, Hints, first_of
-from distrace.fitting.noise_level import noise_of
+from distrace.fitting.multistart import Step, best_of, by_last_loss, charged, decided
+from distrace.fitting.noise_estimation import noise_of
+from distrace.fitting.observations import Seen
 from distrace.fitting.point_residuals import LOOKED, PointProblem, misfits
-from distrace.fitting.seen import Seen
+from distrace.fitting.ray_sampling import drawn
+from distrace.fitting.retrieval import DEPTHS, SILHOUETTE, Hints, first_of
 from distrace.fitting.solver import SolverConfig
-from distrace.fitting.staged import CodeFitConfig, ProblemOf, fitted, stage_of
-from distrace.fitting.starts import Step, best_of, by_last_loss, charged, decided
-from distrace.fitting.targets import drawn
 from distrace.fitting.verdict import contradictions
 from distrace.prior import Prior
-from distrace.quickest import quickest
-from distrace.rounded import Rounded
 
 Verdicts = Callable[[CountedBatch, Sequence[Step]], list[float]]
 """Of the shapes of several steps, which have a field together."""
@@ -43,7 +42,7 @@ def fit_code(
     The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
     """
     pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-    noises, quick = [noise_of(view) for view in views], quickest(decoder)
+    noises, quick = [noise_of(view) for view in views], fastest(decoder)
 
     def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
         targets = [pool.draw(depths, silhouette, random, touching) for pool in pools]
@@ -114,12 +113,12 @@ def fit_points(
     near = samples[samples[:, 3].abs() < FAR]
     some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
     others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    hints, quick = Hints(some[:, :3], some[:, 3]), quickest(decoder)
+    hints, quick = Hints(some[:, :3], some[:, 3]), fastest(decoder)
     return _best(quick, prior, hints, problem, replace(config, more=0, hops=0), partial(_judged, quick, verdicts))
 
 
 def _best(
-    decoder: Decoder | Rounded,
+    decoder: Decoder | BFloat16Decoder,
     prior: Prior,
     hints: Hints,
     problem_of: ProblemOf,
@@ -163,7 +162,7 @@ def _best(
     yield charged(step, [each for start, in_vain in fits.items() if start not in wanted for each in in_vain])
 
 
-def _judged(decoder: Decoder | Rounded, verdicts: Verdicts, steps: Sequence[Step]) -> list[Step]:
+def _judged(decoder: Decoder | BFloat16Decoder, verdicts: Verdicts, steps: Sequence[Step]) -> list[Step]:
     """Steps with the verdicts on their shapes, and what those took: nothing, for a step that has one."""
     began, new = time.perf_counter(), [step for step in steps if not isfinite(step.verdict)]
     if not new:

@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.decoder import Decoder
-from distrace.fitting.starts import Step
+from distrace.fields.decoder import Decoder
+from distrace.fitting.multistart import Step
 from distrace.training.losses import clamped_loss
 
 

@@ -2,15 +2,15 @@
 
 from collections.abc import Iterator
 
-from distrace.checkpoint import Model
+from distrace.checkpoints.model import Model
 from distrace.data.cloud import Cloud
-from distrace.data.view import View
-from distrace.fitting.consistent import MARGIN
+from distrace.data.observation import View
+from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig, fit_shape
 from distrace.fitting.fit_code import fit_code, fit_points
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples, on_surface
-from distrace.fitting.staged import CodeFitConfig
-from distrace.fitting.starts import Step
+from distrace.fitting.free_space import MARGIN
+from distrace.fitting.multistart import Step
 from distrace.prior import Prior, prior_of
 
 METHODS = ("deepsdf", "ours", "ours+mask")  # of the published table

@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from distrace.batch_field import BatchField
-from distrace.decoder import FAR, Decoder
-from distrace.fitting.by_code import derivatives, with_prior
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import FAR, Decoder
+from distrace.fitting.code_jacobian import derivatives, with_prior
+from distrace.fitting.ray_sampling import drawn
 from distrace.fitting.solver import Residuals
-from distrace.fitting.targets import drawn
 from distrace.losses import Weights
 from distrace.prior import Prior
 

@@ -2,11 +2,11 @@
 
 import torch
 
-from distrace.batch_field import BatchField
-from distrace.fitting.noise_level import expected
-from distrace.fitting.seen import Seen
+from distrace.fields.batch import BatchField
+from distrace.fitting.noise_estimation import expected
+from distrace.fitting.observations import Seen
 from distrace.metrics import iou
-from distrace.trace import TraceConfig, sphere_trace
+from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 MOST = 0.1  # a depth that is off by more is as wrong as one that is missed, and so is a ray of the silhouette
 

@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from distrace.data.photograph import Photograph
-from distrace.field import SDF
-from distrace.photographs.pairs import partners
+from distrace.fields.base import SDF
+from distrace.photos.stereo_pairs import partners
 
 ACROSS = 5  # pixels of a patch
 PARTNERS, BEST = 4, 2  # views that each is compared with, and of these those that count: the others may be hidden

@@ -13,13 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.photograph import Photograph
-from distrace.photographs.agreed_depths import NO_DEPTHS, AgreedDepths, contradicted
+from distrace.photos.multiview_depth import NO_DEPTHS, AgreedDepths, contradicted
+from distrace.reconstruction.camera_refinement import motions, relative
+from distrace.reconstruction.colour_refinement import Canvas
 from distrace.reconstruction.matching import Matching
-from distrace.reconstruction.motions import motions, relative
-from distrace.reconstruction.retouch import Canvas
 from distrace.reconstruction.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
 from distrace.reconstruction.terms import Pool, terms_of
-from distrace.training.course import record
+from distrace.training.loss_history import record
 
 STEEPEST = 1.0  # norm of the gradient by the surface's weights: a few rays that graze must not throw it off
 

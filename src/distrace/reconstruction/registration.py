@@ -9,8 +9,8 @@ from copy import deepcopy
 import torch
 
 from distrace.data.photograph import Photograph
+from distrace.reconstruction.camera_refinement import motions, moved
 from distrace.reconstruction.matching import Matching
-from distrace.reconstruction.motions import motions, moved
 from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
 from distrace.reconstruction.terms import Pool, terms_of
 

@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from distrace.field import Counted
+from distrace.fields.base import Counted
 from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
 
 BEND = 2e-4  # of the activation: nearly a ReLU, but with second derivatives

@@ -12,13 +12,13 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from distrace.data.photograph import Photograph
-from distrace.field import value_and_gradient
-from distrace.fitting.targets import band
+from distrace.fields.base import value_and_gradient
+from distrace.fitting.ray_sampling import band
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.reconstruction.matching import ACROSS, Matching
 from distrace.reconstruction.surface_network import ColourNetwork, Surface
 from distrace.surface import attach, minimum
-from distrace.trace import Trace, TraceConfig, sphere_trace
+from distrace.tracing.sphere_tracing import Trace, TraceConfig, sphere_trace
 
 MARCH = TraceConfig(coarse_levels=0, step_scale=1.0, tolerance=1e-3, steps=64, least_step=4e-3)
 NEAR_OUTLINE = 31  # pixels across the band from which half of the background's rays are drawn

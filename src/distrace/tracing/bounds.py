@@ -9,8 +9,8 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.functional import normalize
 
-from distrace.batch_field import BatchField
-from distrace.field import SDF
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.rays import Bounds, Rays
 from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import Lines

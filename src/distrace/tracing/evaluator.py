@@ -4,10 +4,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from distrace.batch_field import BatchField, CountedBatch
-from distrace.decoder import ShapeField
-from distrace.field import SDF, Counted, asked
-from distrace.quickest import quickest
+from distrace.fields.base import SDF, Counted, asked
+from distrace.fields.batch import BatchField, CountedBatch
+from distrace.fields.decoder import ShapeField
+from distrace.fields.precision import fastest
 from distrace.tracing.images import Lines
 
 ROUGH_ERROR = 7e-4  # of values: 8 × 512 decoders in bfloat16 near their surfaces, but for one in a thousand
@@ -66,7 +66,7 @@ def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
     decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
     if decoder is None or code is None:
         return None
-    quick = quickest(decoder)
+    quick = fastest(decoder)
     return None if quick is decoder else quick.field(code.detach())
 
 

@@ -7,15 +7,15 @@ import torch
 from jaxtyping import Float, Int, Shaped
 from torch import Tensor
 
-from distrace.batch_field import BatchField
 from distrace.camera import Camera
-from distrace.field import SDF
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.rays import Rays
-from distrace.trace import Outcome, Trace
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import ALONE, BRACKET, NEAR, ROUGH, Looked, State, evaluations, march, march_cones
+from distrace.tracing.sphere_tracing import Outcome, Trace
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
 GAP = 0.003  # radii of a ray, and half a pixel, at most, that the balls around its samples may leave unchecked

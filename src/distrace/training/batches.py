@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from distrace.checkpoint import VARIANT
+from distrace.checkpoints.model import VARIANT
 from distrace.errors import explained
 
 Batch = tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]

@@ -1,0 +1,1 @@
+"""Models on disk: ours, DeepSDF's experiments, and other people's dialects of these."""

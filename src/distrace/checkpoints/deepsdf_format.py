@@ -1,0 +1,88 @@
+"""The weights and codes in DeepSDF's experiment folders, in every dialect that writers of them have used.
+
+`ModelParameters/NAME.pth` and `LatentCodes/NAME.pth`: Park et al., *DeepSDF*, CVPR 2019. Nothing in a file is ever run.
+"""
+
+import pickle
+import re
+import warnings
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.errors import explained
+from distrace.fields.decoder import Decoder
+from distrace.files import written
+
+LATEST = "latest.pth"
+BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
+SPLINES = "latent_fields_state_dict"
+
+
+def write_weights(folder: Path, decoder: Decoder, codes: Float[Tensor, "shapes length"]) -> None:
+    """With the key names that DeepSDF's original code reads."""
+    state = {_classic(key): value.detach().cpu() for key, value in decoder.state_dict().items()}
+    with written(folder / "ModelParameters" / LATEST) as file:
+        torch.save({"epoch": 0, "model_state_dict": state}, file)
+    with written(folder / "LatentCodes" / LATEST) as file:
+        torch.save({"epoch": 0, "latent_codes": {"weight": codes.detach().cpu()}}, file)
+
+
+def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "shapes length"]]:
+    """The file that was read, a decoder's weights by our names, and the codes.
+
+    Raises `ValueError`, in one sentence, for what is missing, or holds something else.
+    """
+    weights = _checkpoint(folder / "ModelParameters")
+    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict"):
+        stored = _unpickled(weights)["model_state_dict"]
+        state = {_modern(key): tensor.float() for key, tensor in stored.items() if BESIDE not in key}
+    latent = folder / "LatentCodes" / weights.name
+    if not latent.is_file():
+        raise ValueError(f"{latent} is missing: the codes that belong to {weights.name} of ModelParameters")
+    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes"):
+        codes = _codes(_unpickled(latent))
+    return weights, state, codes
+
+
+def _unpickled(path: Path) -> dict:
+    """A file of tensors, and nothing that a pickle could run."""
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return torch.load(path, map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, KeyError):
+        raise ValueError("it holds something else than tensors; nothing in it was run") from None
+
+
+def _checkpoint(folder: Path) -> Path:
+    """`latest.pth`, or else the one of the most epochs."""
+    found = sorted(folder.glob("*.pth"), key=lambda path: int(path.stem) if path.stem.isdecimal() else -1)
+    if not found:
+        raise ValueError(f"{folder} holds no checkpoint; {LATEST} or one named by its epoch (2000.pth) is looked for")
+    return folder / LATEST if (folder / LATEST) in found else found[-1]
+
+
+def _codes(content: dict) -> Float[Tensor, "shapes length"]:
+    """A code per shape; or, where codes vary over space (DeepSDFStruct's latent fields), all their control points."""
+    if SPLINES in content:  # their `latent_codes` are zeros
+        return torch.cat([value.float() for key, value in content[SPLINES].items() if key.endswith("control_points")])
+    stored = content["latent_codes"]
+    if isinstance(stored, dict):
+        stored = stored["weight"] if "weight" in stored else list(stored.values())
+    if isinstance(stored, list):
+        stored = torch.stack([code.reshape(-1) for code in stored])
+    return stored.detach().float().reshape(len(stored), -1)
+
+
+def _classic(key: str) -> str:
+    key = key.replace("parametrizations.weight.original0", "weight_g")
+    return "module." + key.replace("parametrizations.weight.original1", "weight_v")
+
+
+def _modern(key: str) -> str:
+    key = key.removeprefix("module.")
+    key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
+    return re.sub(r"weight_v$", "parametrizations.weight.original1", key)

@@ -1,0 +1,189 @@
+"""Models on disk: DeepSDF's experiment folders, in every dialect that writers of them have used, and the bundled ones.
+
+A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and
+`LatentCodes/NAME.pth` (DeepSDF's). Nothing in a file is ever run.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import safetensors.torch
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.checkpoints.deepsdf_format import read_weights, write_weights
+from distrace.errors import explained
+from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.files import written
+
+BUNDLED = Path(str(files("distrace"))) / "models"
+VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+
+
+@dataclass(frozen=True)
+class Model:
+    """A trained decoder and the codes of the shapes it was trained on. Weights are frozen: `requires_grad_()` thaws."""
+
+    name: str
+    decoder: Decoder
+    codes: Float[Tensor, "shapes length"]
+    shapes: tuple[str, ...]
+
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
+        """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
+
+        Raises `ValueError` for a number or a length that the model has not.
+        """
+        if isinstance(code, Tensor | np.ndarray):
+            return self.decoder.field(code)
+        if not 0 <= code < len(self.codes):
+            raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
+        return self.decoder.field(self.codes[code])
+
+    def code_of(self, shape: str) -> Float[Tensor, "length"]:
+        """Of a shape that it was trained on, by name."""
+        return self.codes[self.shapes.index(shape)]
+
+    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
+        """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
+        known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
+        return torch.stack([known.get(shape, known.get(original(shape), mean)) for shape in shapes])
+
+    def to(self, device: torch.device | str) -> "Model":
+        return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
+
+
+def original(shape: str) -> str:
+    """The name of what a variant was made of; of other shapes their own."""
+    return shape.split(VARIANT)[0]
+
+
+def bundled_models() -> list[str]:
+    """The names that `load_model` knows without a folder."""
+    return sorted(path.parent.name for path in BUNDLED.glob("*/specs.json"))
+
+
+def load_model(name: str | Path) -> Model:
+    """A bundled model by name, or any DeepSDF experiment folder.
+
+    Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
+    """
+    folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
+    if not folder.is_dir():
+        raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
+    specs, shapes = _read_specs(folder)
+    ours = folder / "model.safetensors"
+    source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
+    with explained(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
+        decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
+    decoder = _filled(decoder, state, source)
+    _check_codes(codes, specs, folder)
+    names = shapes if len(shapes) == len(codes) else tuple(str(number) for number in range(len(codes)))
+    return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
+
+
+def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
+    """Writes our own, smaller form into a folder: weight norm multiplied out, in half precision."""
+    specs = model.decoder.specs
+    plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
+    tensors = {key: value for key, value in model.decoder.state_dict().items() if "parametrizations" not in key}
+    tensors |= {"codes": model.codes}
+    for layer in range(model.decoder.depth):
+        tensors[f"lin{layer}.weight"] = getattr(model.decoder, f"lin{layer}").weight
+    _write_specs(folder, plain, model.shapes)
+    with written(folder / "model.safetensors") as file:
+        file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
+
+
+def save_experiment(folder: Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
+    """Writes DeepSDF's own layout, with the key names that its original code reads."""
+    _write_specs(folder, decoder.specs, shapes)
+    write_weights(folder, decoder, codes)
+
+
+def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> None:
+    network = asdict(specs)
+    length = network.pop("code_length")
+    content = {"NetworkArch": "deep_sdf_decoder", "NetworkSpecs": network, "CodeLength": length, "Shapes": shapes}
+    with written(folder / "specs.json") as file:
+        file.write(json.dumps(content, indent=1).encode())
+
+
+def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
+    path = folder / "specs.json"
+    if not path.is_file():
+        raise ValueError(
+            f"{folder} is not a DeepSDF experiment: it has no specs.json, which names the network's layers"
+        )
+    with explained(f"{path} is not a DeepSDF specification"):
+        content = json.loads(path.read_text(encoding="utf-8"))
+        _check_architecture(content)
+        network = content["NetworkSpecs"]
+        specs = NetworkSpecs(
+            dims=tuple(int(width) for width in network["dims"]),
+            code_length=int(content["CodeLength"]),
+            latent_in=_layers(network, "latent_in"),
+            norm_layers=_layers(network, "norm_layers"),
+            weight_norm=bool(network.get("weight_norm", False)),
+            xyz_in_all=bool(network.get("xyz_in_all", False)),
+            use_tanh=bool(network.get("use_tanh", False)),
+            dropout=_layers(network, "dropout"),
+            dropout_prob=float(network.get("dropout_prob") or 0.0),
+        )
+        shapes = tuple(str(shape) for shape in content.get("Shapes") or ())
+    return specs, shapes
+
+
+def _check_architecture(content: dict) -> None:
+    architecture = content.get("NetworkArch") or "deep_sdf_decoder"
+    dimension = content["NetworkSpecs"].get("geom_dimension") or 3
+    if architecture != "deep_sdf_decoder" or dimension != 3:
+        raise ValueError(f"{architecture} of {dimension}-D points; only deep_sdf_decoder of 3-D points can be read")
+
+
+def _layers(network: dict, key: str) -> tuple[int, ...]:
+    return tuple(int(layer) for layer in network.get(key) or ())
+
+
+def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
+    with explained(f"{path} is not a safetensors file of a model"):
+        tensors = {key: tensor.float() for key, tensor in safetensors.torch.load_file(path).items()}
+        codes = tensors.pop("codes")
+    return path, tensors, codes
+
+
+def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
+    if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
+        given, wanted = list(codes.shape), f"[n, {specs.code_length}]"
+        raise ValueError(f"{folder} has codes of shape {given}, but specs.json asks for {wanted}")
+    if not codes.isfinite().all():
+        raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
+
+
+def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
+    """The decoder with the weights put in, after a look at each: their names, shapes and values."""
+    expected = decoder.state_dict()
+    for key in sorted(expected.keys() | state.keys()):
+        if key not in state:
+            raise ValueError(f"{source} lacks {key}, which specs.json calls for")
+        if key not in expected:
+            raise ValueError(f"{source} has {key}, for which specs.json has no place")
+        if state[key].shape != expected[key].shape:
+            given, wanted = list(state[key].shape), list(expected[key].shape)
+            raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
+        if state[key].layout != torch.strided:
+            raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")
+        if not state[key].isfinite().all():
+            raise ValueError(f"{source}: {key} has values that are not finite; the training that wrote it has diverged")
+    decoder.load_state_dict(state, assign=True)
+    for layer in range(decoder.depth):
+        if not getattr(decoder, f"lin{layer}").weight.isfinite().all():  # weight norm divides by a norm
+            raise ValueError(f"{source}: the weights of lin{layer} are not finite: its weight norm has a row of zeros")
+    return decoder

@@ -1,0 +1,117 @@
+"""Masks of an object that was photographed before a dark background: whatever is not the background's colours."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from skimage.filters import gaussian, sobel, threshold_li, threshold_otsu
+from skimage.measure import label
+from skimage.morphology import dilation, disk, erosion, opening, remove_small_holes, skeletonize
+from skimage.segmentation import watershed
+
+from distrace.data.photographs import Photographs
+from distrace.data.placement import Placement
+from distrace.data.space_carving import within_masks
+
+DARK = 0.15  # brightness that most pixels along the edges of the images stay below
+SAMPLED = 200_000  # pixels that tell the background's colours
+NOISE = 1 / 255  # standard deviation of a colour, at least
+THREAD = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
+HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows …
+NICHE = 1e-2  # … and so are those that are smaller than this, if their median colour is none of the background's:
+UNLIKELY = 4.03  # standard deviations, beyond which lies one in a thousand of a Gaussian's draws in three dimensions
+LIT = 4  # pixels: what is between background and object, and deeper in the latter, is its shadow; the rest is lit cloth
+UNSURE = 2  # pixels on each side of an outline, within which its place is where the image changes most
+
+
+def masked(photographs: Photographs) -> Photographs:
+    """Photographs with masks: those that they have, or what stands out from a dark background.
+
+    Where there were some without, and nobody said where the unit sphere is, it is put around what the masks allow.
+    Raises `ValueError` where some have no mask and the background is not dark, or nothing stands out from it.
+    """
+    views = photographs.views
+    if all(view.mask is not None for view in views):
+        return photographs
+    without = [view.name for view in views if view.mask is None]
+    edges = np.concatenate([_edge(view.image.amax(-1).numpy()) for view in views])
+    if np.median(edges) > DARK:
+        raise ValueError(
+            f"{without[0]} and {len(without) - 1} others have no mask, and their background is not dark: half of the"
+            f" pixels along the edges are brighter than {np.median(edges):.2f}; give masks, white where the object is"
+        )
+    masks = dark_masks([view.image for view in views])
+    found = tuple(
+        replace(view, mask=mask) if view.mask is None else view for view, mask in zip(views, masks, strict=True)
+    )
+    empty = [view.name for view in found if not view.known_mask.any()]
+    if 2 * len(empty) > len(found):
+        raise ValueError(
+            f"in {len(empty)} of {len(found)} views, as {empty[0]}, nothing stands out from the dark; give masks"
+        )
+    return replace(photographs, views=found) if photographs.told else _placed_again(replace(photographs, views=found))
+
+
+def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torch.Tensor, "_ _"]]:
+    """What stands out from the background of all images together: the largest part of each.
+
+    Distances from the mean colour of what is dark are measured in its standard deviations (Mahalanobis, 1936), so that
+    cloth that catches some light is still background, for it is grey. What is nearer than Li's threshold (Li and Tam,
+    Pattern Recognition Letters 1998) is background, what is farther than Otsu's (1979) is object; between them, and
+    about them, for thresholds dilate what is bright, a watershed puts the outline where the image changes most.
+    """
+    colours = np.concatenate([image.numpy().reshape(-1, 3) for image in images])
+    colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
+    bright = colours.max(-1)
+    if bright.max() - bright.min() < NOISE:
+        raise ValueError(
+            f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks"
+        )
+    dark = colours[bright < threshold_li(bright)]
+    mean, whiten = dark.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
+    apart = _apart(colours, mean, whiten)
+    low = threshold_li(apart)
+    high = max(threshold_otsu(apart), low)
+    smooth = (gaussian(image.numpy(), 1.0, channel_axis=-1) for image in images)
+    return [torch.from_numpy(_stands_out(_apart(image, mean, whiten), low, high)) for image in smooth]
+
+
+def _apart(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+    return np.linalg.norm((colours - mean) @ whiten.T, axis=-1)
+
+
+def _stands_out(apart: np.ndarray, low: float, high: float) -> np.ndarray:
+    about, surely = (_largest(apart > threshold) for threshold in (low, high))
+    core = erosion(surely, disk(UNSURE)) | skeletonize(surely) | erosion(about, disk(LIT))  # a skeleton keeps threads
+    markers = np.where(dilation(about, disk(UNSURE)), 0, 1)
+    markers[core] = 2
+    return _with_niches(np.asarray(watershed(sobel(apart), markers) == 2), apart)
+
+
+def _with_niches(mask: np.ndarray, apart: np.ndarray) -> np.ndarray:
+    """With the holes that are too small for background, and lighter."""
+    parts = np.asarray(label(remove_small_holes(mask, max_size=round(NICHE * mask.size)) & ~mask, connectivity=1))
+    lighter = [hole for hole in range(1, parts.max() + 1) if np.median(apart[parts == hole]) > UNLIKELY]
+    return mask | np.isin(parts, lighter)
+
+
+def _largest(mask: np.ndarray) -> np.ndarray:
+    """The largest part, without dirt and with its shadows."""
+    parts = np.asarray(label(opening(mask, disk(THREAD))))
+    largest = parts == (1 + np.bincount(parts.ravel())[1:].argmax() if parts.any() else -1)
+    return np.asarray(remove_small_holes(largest, max_size=round(HOLE * parts.size)))
+
+
+def _edge(image: np.ndarray) -> np.ndarray:
+    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+
+
+def _placed_again(photographs: Photographs) -> Photographs:
+    """In the sphere around what the masks allow."""
+    views, before = photographs.views, photographs.placement
+    sphere = within_masks(*zip(*((view.camera, view.known_mask) for view in views if view.known_mask.any())))
+    placed = tuple(replace(view, camera=sphere.camera_to_unit(view.camera)) for view in views)
+    there = Placement(before.to_world(sphere.centre), before.radius * sphere.radius)
+    return replace(photographs, views=placed, placement=there)

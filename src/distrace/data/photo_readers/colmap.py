@@ -1,0 +1,67 @@
+"""COLMAP's models, text or binary (Schönberger and Frahm, CVPR 2016), read by its own library."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from distrace.data.photo_readers.colmap_files import check_whole
+from distrace.data.photo_readers.frames import Shot, Shots, inside
+from distrace.errors import about, explained
+
+FOLDERS = ("sparse/0", "sparse", ".")
+PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
+OBSERVED = 3  # images at least that see a point which is trusted
+
+
+def read(folder: Path) -> Shots | None:
+    """None where there is no model; raises `ValueError` for one that cannot be read, or is distorted.
+
+    COLMAP's pixel centres are at +0.5, as ours. Images that it did not place are left out.
+    """
+    places = [folder / name for name in FOLDERS]
+    model = next((place for place in places for kind in ("bin", "txt") if (place / f"cameras.{kind}").is_file()), None)
+    if model is None:
+        return None
+    check_whole(model)
+    from pycolmap import Reconstruction  # here, as loading it takes longer than reading most folders
+
+    with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
+        found = Reconstruction(model)
+    placed = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
+    return Shots("COLMAP", tuple(_shot(folder, model, image) for image in placed), points=_points(found))
+
+
+def _shot(folder: Path, model: Path, image: Any) -> Shot:
+    field = f"{model}: image {image.name}"
+    with about(field):
+        camera = image.camera
+        if camera.model_name not in PINHOLES:
+            raise ValueError(
+                f"its camera is of the model {camera.model_name}, and only PINHOLE and SIMPLE_PINHOLE are read;"
+                " undistort with colmap image_undistorter"
+            )
+        path = inside(folder / "images", image.name, "its name")
+        if not path.is_file():
+            raise ValueError(f"there is no {image.name} in {folder / 'images'}")
+        pose = np.eye(4)
+        pose[:3] = image.cam_from_world().inverse().matrix()
+        mask = _mask(folder / "masks", image.name)
+        return Shot(field, path, camera.calibration_matrix(), pose, mask, (camera.height, camera.width))
+
+
+def _mask(masks: Path, name: str) -> Path | None:
+    """NAME.png, as COLMAP calls it, or .png in place of the suffix; None only where there is no folder of masks."""
+    if not masks.is_dir():
+        return None
+    candidates = [masks / f"{name}.png", (masks / name).with_suffix(".png")]
+    found = next((path for path in candidates if path.is_file()), None)
+    if found is None:
+        raise ValueError(f"there is neither {candidates[0].name} nor {candidates[1].name} in {masks}")
+    return found
+
+
+def _points(found: Any) -> Float[np.ndarray, "points 3"]:
+    points = [point.xyz for point in found.points3D.values() if point.track.length() >= OBSERVED]
+    return np.array(points, np.float64).reshape(-1, 3)

@@ -1,0 +1,38 @@
+"""Our own layout: `views.json` beside the images, with matrices as distrace has them."""
+
+from pathlib import Path
+from typing import Any
+
+from distrace.data.photo_readers.frames import Shot, Shots, file_of, listed, matrix, read_json
+from distrace.data.placement import Placement, placement_of
+from distrace.errors import about
+
+NAME = "views.json"
+
+
+def read(folder: Path) -> Shots | None:
+    """None where there is no views.json; raises `ValueError` for one that is not as it should be."""
+    path = folder / NAME
+    if not path.is_file():
+        return None
+    content = read_json(path)
+    entries = listed(content, "views", path)
+    shots = tuple(_shot(folder, entry, f"{path}: views[{k}]") for k, entry in enumerate(entries))
+    return Shots("views.json", shots, _placement(content, path))
+
+
+def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
+    with about(field):
+        image = file_of(folder, entry, "image")
+        mask = file_of(folder, entry, "mask") if entry.get("mask") is not None else None
+        return Shot(field, image, matrix(entry, "intrinsics", 3, 3), matrix(entry, "T_world_camera", 4, 4), mask)
+
+
+def _placement(content: dict[str, Any], path: Path) -> Placement | None:
+    sphere = content.get("unit_sphere")
+    if sphere is None:
+        return None
+    with about(f"{path}: unit_sphere"):
+        if not isinstance(sphere, dict):
+            raise ValueError(f"it is {sphere!r}; it has a centre and a radius")
+        return placement_of(sphere.get("centre"), sphere.get("radius"))

@@ -1,0 +1,85 @@
+"""`transforms.json`, as NeRF (Mildenhall et al., ECCV 2020), instant-ngp and nerfstudio write it."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, file_of, listed, matrix, read_json
+from distrace.data.pictures import picture_size
+from distrace.data.placement import MOST
+from distrace.errors import about
+
+NAMES = ("transforms.json", "transforms_train.json")
+UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # if terms are zero
+TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # its cameras look along −z, with y up
+
+
+def read(folder: Path) -> Shots | None:
+    """None where there is no such file; raises `ValueError` for one that is not as it should be.
+
+    The world stays as it is: often z is up in it.
+    """
+    path = next((folder / name for name in NAMES if (folder / name).is_file()), None)
+    if path is None:
+        return None
+    content = read_json(path)
+    entries = listed(content, "frames", path)
+    shots = tuple(_shot(folder, content | entry, f"{path}: frames[{k}]") for k, entry in enumerate(entries))
+    return Shots(path.name, shots)
+
+
+def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
+    """Of a frame, with what is said for all frames wherever it says nothing itself."""
+    with about(field):
+        _check_distortion(entry)
+        image = file_of(folder, entry, "file_path", ("", *SUFFIXES))
+        mask = file_of(folder, entry, "mask_path", ("", *SUFFIXES)) if entry.get("mask_path") is not None else None
+        told = "w" in entry and "h" in entry
+        size = (int(_number(entry, "h")), int(_number(entry, "w"))) if told else picture_size(image)
+        pose = matrix(entry, "transform_matrix", 4, 4) @ OPENGL
+        return Shot(f"{field}.transform_matrix", image, _intrinsics(entry, *size), pose, mask, size)
+
+
+def _check_distortion(entry: dict[str, Any]) -> None:
+    model = entry.get("camera_model", "OPENCV")
+    if model not in UNDISTORTED:
+        raise ValueError(f"camera_model is {model!r}, and only pinhole cameras are read; undistort the images first")
+    for name in TERMS:
+        if name in entry and _number(entry, name) != 0:
+            raise ValueError(f"{name} is {entry[name]}: the images are distorted; undistort them first, to {name} 0")
+
+
+def _intrinsics(entry: dict[str, Any], height: int, width: int) -> np.ndarray:
+    focal_x, focal_y = _focal(entry, "x", width), _focal(entry, "y", height)
+    if focal_x is None and focal_y is None:
+        raise ValueError("there is neither fl_x nor camera_angle_x; one tells the focal length")
+    across = _number(entry, "cx") if "cx" in entry else width / 2
+    down = _number(entry, "cy") if "cy" in entry else height / 2
+    return np.array([[focal_x or focal_y, 0, across], [0, focal_y or focal_x, down], [0, 0, 1]], np.float64)
+
+
+def _focal(entry: dict[str, Any], axis: str, length: int) -> float | None:
+    """In pixels; None where it is not told along this axis."""
+    if f"fl_{axis}" in entry:
+        return _positive(entry, f"fl_{axis}", math.inf)
+    if f"camera_angle_{axis}" in entry:
+        return length / 2 / math.tan(_positive(entry, f"camera_angle_{axis}", math.pi) / 2)
+    return None
+
+
+def _positive(entry: dict[str, Any], name: str, below: float) -> float:
+    value = _number(entry, name)
+    if not 0 < value < below:
+        unit = "pixels" if below == math.inf else "radians, below π"
+        raise ValueError(f"{name} is {value}; it is positive, in {unit}")
+    return value
+
+
+def _number(entry: dict[str, Any], name: str) -> float:
+    value = entry[name]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST:
+        raise ValueError(f"{name} is {value!r}; a number is needed")
+    return float(value)

@@ -1,0 +1,225 @@
+"""The DeepSDF network: a point and a shape's code to a signed distance (Park et al., CVPR 2019, section 4)."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor, nn
+from torch.nn import functional as F
+from torch.nn.utils.parametrizations import weight_norm
+
+from distrace.fields.base import SDF, flattened, in_chunks
+from distrace.fields.batch import BatchField
+from distrace.fields.products import Layer, Product, evaluated, joined, linear
+
+QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
+ROUND = 16  # widths that processors like
+SAMPLED = 8  # deviations are measured at every so many points
+CHUNK = 1 << 20  # points evaluated at a time without derivatives, and with …
+RECORDED_CHUNK = 4096  # … on a CPU: a layer's fresh activations then stay in the cache
+FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond
+
+
+@dataclass(frozen=True)
+class NetworkSpecs:
+    """The architecture, with the keys of `NetworkSpecs` in DeepSDF's `specs.json`."""
+
+    dims: tuple[int, ...] = (512,) * 8
+    code_length: int = 256
+    latent_in: tuple[int, ...] = (4,)
+    norm_layers: tuple[int, ...] = tuple(range(8))
+    weight_norm: bool = True
+    xyz_in_all: bool = False
+    use_tanh: bool = False
+    dropout: tuple[int, ...] = ()
+    dropout_prob: float = 0.0
+
+
+class Decoder(nn.Module):
+    """f(point; code): ReLU layers `lin0 … linN`, the input fed again at the layers `latent_in`, tanh at the end.
+
+    Raises `ValueError` for layers without room for what is fed again.
+    """
+
+    def __init__(self, specs: NetworkSpecs = NetworkSpecs()) -> None:
+        super().__init__()
+        self.specs = specs
+        widths = [specs.code_length + 3, *specs.dims, 1]
+        outputs = [self._outputs(widths, layer) for layer in range(self.depth)]
+        if specs.code_length < 1 or min(outputs) < 1:
+            given = f"a code of {specs.code_length} and layers of {outputs} outputs"
+            raise ValueError(f"{given} were asked for, what is fed again set apart; each must be at least 1")
+        for layer in range(self.depth):
+            linear = nn.Linear(widths[layer], outputs[layer])
+            normed = layer in specs.norm_layers
+            setattr(self, f"lin{layer}", weight_norm(linear) if normed and specs.weight_norm else linear)
+            if normed and not specs.weight_norm:  # the last layer's is never used, but DeepSDF's files hold it
+                setattr(self, f"bn{layer}", nn.LayerNorm(linear.out_features))
+
+    @property
+    def depth(self) -> int:
+        return len(self.specs.dims) + 1
+
+    @property
+    def has_layer_norms(self) -> bool:
+        return bool(self.specs.norm_layers) and not self.specs.weight_norm
+
+    def is_fed(self, layer: int) -> bool:
+        """Whether points enter a layer, with or without the code."""
+        return layer == 0 or layer in self.specs.latent_in or self.specs.xyz_in_all
+
+    def _outputs(self, widths: list[int], layer: int) -> int:
+        if layer + 1 in self.specs.latent_in:
+            return widths[layer + 1] - widths[0]
+        joins_points = self.specs.xyz_in_all and layer < self.depth - 1
+        return widths[layer + 1] - (3 if joins_points else 0)
+
+    def forward(
+        self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]
+    ) -> Float[Tensor, "*batch"]:
+        """Values in (-1, 1). A code with batch axes of size 1 enters the first layer once, not per point.
+
+        Under autocast points and code keep their precision: in bfloat16 a point at 0.8 would be off by up to 0.002.
+        """
+        with torch.autocast(points.device.type, enabled=False):
+            layers = self.folded(code)
+        return self._run(layers, points)
+
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField[ShapeField]":
+        """The signed distance field of one shape or, from codes [B, length], the field of B shapes.
+
+        Constant codes are folded into the biases of the layers they enter. In the decoder's precision, whatever the
+        codes'. Raises `ValueError` for a code of another length.
+        """
+        code = self.checked(code)
+        return self.fields(code) if code.dim() == 2 else self._single(code)
+
+    def fields(self, codes: Float[Tensor | np.ndarray, "shapes length"]) -> "BatchField[ShapeField]":
+        """The field of several shapes, as `field` gives it."""
+        codes = self.checked(codes)
+        return BatchField(codes, Evaluation(self, self.folded(codes)), self._single)
+
+    def _single(self, code: Tensor) -> "ShapeField":
+        return ShapeField(self, self.folded(code), code)
+
+    def checked(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> Float[Tensor, "*shapes length"]:
+        """A code, or several, in the decoder's precision and on its device. Raises `ValueError` for another length."""
+        code, length = torch.as_tensor(code).to(next(self.parameters())), self.specs.code_length
+        if code.dim() not in (1, 2) or code.shape[-1] != length:
+            takes = f"[shapes, {length}]" if code.dim() == 2 else [length]
+            raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
+        return code
+
+    def folded(self, code: Float[Tensor, "*batch length"]) -> list[Layer]:
+        """Each layer's weight without the code's columns, and its bias with what the code adds: [*batch, outputs]."""
+        layers, length = [], self.specs.code_length
+        for layer in range(self.depth):
+            linear = getattr(self, f"lin{layer}")
+            weight, bias = linear.weight, linear.bias
+            if layer == 0 or layer in self.specs.latent_in:
+                start = weight.shape[1] - length - 3
+                bias = F.linear(code, weight[:, start : start + length], bias)
+                weight = torch.cat([weight[:, :start], weight[:, start + length :]], dim=1)
+            layers.append((weight, bias))
+        return layers
+
+    def _run(self, layers: list[Layer], points: Tensor, watch: Callable[[int, Tensor], None] | None = None) -> Tensor:
+        x = points[..., :0]
+        for layer, (weight, bias) in enumerate(layers):
+            x = joined(x, points, weight, bias) if self.is_fed(layer) else linear(x, weight, bias)
+            if layer < self.depth - 1:
+                if watch:
+                    watch(layer, x)
+                x = self._activated(x, layer)
+        return self.ended(x[..., 0])
+
+    def ended(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """The last layer's outputs, bent by tanh."""
+        return torch.tanh(torch.tanh(x) if self.specs.use_tanh else x)
+
+    def _activated(self, x: Tensor, layer: int) -> Tensor:
+        norm = getattr(self, f"bn{layer}", None)
+        x = F.relu(x if norm is None else norm(x), inplace=not torch.is_grad_enabled())
+        if layer in self.specs.dropout:
+            x = F.dropout(x, self.specs.dropout_prob, self.training)
+        return x
+
+
+class Evaluation:
+    """Values at points, by layers that one code is folded into, or several: then `shape` numbers each point's shape."""
+
+    def __init__(self, decoder: Decoder, layers: list[Layer]) -> None:
+        self.decoder, self.layers = decoder, layers
+        self.products = [Product.of(layer, decoder.is_fed(number)) for number, layer in enumerate(layers)]
+
+    def __call__(self, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
+        """Raises `ValueError` for points of another precision than the decoder's."""
+        weight = self.layers[0][0]
+        if points.dtype != weight.dtype:
+            raise ValueError(
+                f"points in {points.dtype} were given to a decoder in {weight.dtype}; give a camera in that precision,"
+                " or change the decoder's by `.double()` or `.float()`"
+            )
+        on_cpu = weight.device.type == "cpu"
+        quick = on_cpu and not torch.is_grad_enabled() and not self.decoder.has_layer_norms
+        quick = quick and not self.decoder.training and not torch._C._are_functorch_transforms_active()
+        size = RECORDED_CHUNK if on_cpu and not quick else CHUNK
+        return in_chunks(self._quick if quick else self._recorded, size, points, *([] if shape is None else [shape]))
+
+    def _quick(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
+        return self.decoder.ended(evaluated(self.products, points, shape))
+
+    def _recorded(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
+        """By operations that autograd, autocast and `torch.func` see through."""
+        layers = self.layers if shape is None else [(w, b if b.dim() == 1 else b[shape]) for w, b in self.layers]
+        return self.decoder._run(layers, points)
+
+
+class ShapeField:
+    """The field of one shape: a decoder whose layers have the shape's code folded in, if it is known which."""
+
+    def __init__(self, decoder: Decoder, layers: list[Layer], code: Float[Tensor, "length"] | None = None) -> None:
+        self.decoder, self.layers, self.code = decoder, layers, code
+        self.evaluate = Evaluation(decoder, layers)
+
+    def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        return flattened(self.evaluate, points)
+
+    @torch.no_grad()
+    def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
+        """Values at points, and the same field without the ReLU units that are off, by a margin, at all of them.
+
+        Around the points it has the same values to rounding, at half the cost for an 8 × 512 decoder near its surface.
+        """
+        last = len(self.layers) - 1
+        if not len(points) or self.decoder.has_layer_norms or self.decoder.training:
+            return self(points), self  # a layer's norm is over all of its units
+        highest = [torch.full_like(bias, -torch.inf) for _, bias in self.layers[:last]]
+        deviation = [torch.zeros_like(bias) for _, bias in self.layers[:last]]
+
+        def watch(layer: int, x: Tensor) -> None:
+            highest[layer] = highest[layer].maximum(x.amax(0))
+            deviation[layer] = deviation[layer].maximum(x[::SAMPLED].std(0, correction=0))
+
+        values = in_chunks(partial(self.decoder._run, self.layers, watch=watch), RECORDED_CHUNK, points)
+        kept = [_on(*both) for both in zip(highest, deviation, strict=True)]
+        with torch.enable_grad():  # what surfaces are attached to is as differentiable as the whole
+            return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
+
+    def _thinned(self, layer: int, kept: list[Tensor]) -> Layer:
+        """A layer without the rows of its own units that are off, and without the columns of those before."""
+        weight, bias = self.layers[layer]
+        if layer:
+            fed = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)  # the points
+            weight = weight[:, torch.cat([kept[layer - 1], fed])]
+        return (weight[kept[layer]], bias[kept[layer]]) if layer < len(kept) else (weight.contiguous(), bias)
+
+
+def _on(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Tensor:
+    """The units that come near zero or above, and a few more for a round width."""
+    level = highest / deviation.clamp_min(1e-12)
+    count = -(-int((level > -QUIET).sum()) // ROUND) * ROUND
+    return level.topk(min(max(count, ROUND), len(level))).indices.sort().values

@@ -1,0 +1,220 @@
+"""A decoder in bfloat16: half the time where the processor has such products, and as right as a search needs."""
+
+from functools import cached_property, lru_cache, partial
+
+import torch
+from jaxtyping import Float, Int, Shaped
+from torch import Tensor
+from torch.nn import functional as F
+from torch.nn.functional import pad
+
+from distrace.fields.base import SDF, flattened, in_chunks
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import CHUNK, Decoder
+from distrace.fields.products import LINEAR_RELU, Layer
+
+PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
+ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
+MANY = 1 << 16  # … of fewer rows than these
+
+
+class BFloat16Decoder:
+    """The same shapes; values near the surface of an 8 × 512 decoder are off by 1e-4 to 3e-4, and by 1e-3 at most."""
+
+    def __init__(self, decoder: Decoder) -> None:
+        self.decoder = decoder
+
+    def __call__(
+        self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]
+    ) -> Float[Tensor, "*batch"]:
+        """Values, and derivatives as rounded. Points and codes keep their precision."""
+        with torch.autocast(points.device.type, torch.bfloat16):
+            return self.decoder(points, code).float()
+
+    def field(self, code: Float[Tensor, "*shapes length"]) -> SDF | BatchField[SDF]:
+        """The field of one shape or, from codes [B, length], of B shapes; without derivatives.
+
+        Raises `ValueError` for a code of another length.
+        """
+        return self.fields(code) if code.dim() == 2 else self._single(code)
+
+    def fields(self, codes: Float[Tensor, "shapes length"]) -> BatchField[SDF]:
+        """The field of several shapes, as `field` gives it."""
+        layers = self.layers(codes)
+
+        def evaluate(points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
+            return in_chunks(partial(self._values, layers), CHUNK, points, shape)
+
+        return BatchField(codes, evaluate, self._single)
+
+    def _single(self, code: Float[Tensor, "length"]) -> SDF:
+        layers = self.layers(code)
+
+        def evaluate(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+            return flattened(lambda flat: in_chunks(partial(self._values, layers), CHUNK, flat), points)
+
+        return evaluate
+
+    @torch.no_grad()
+    def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
+        """Those of a field, with biases [*shapes, outputs], in bfloat16, except those that points enter."""
+        layers = enumerate(self.decoder.folded(self.decoder.checked(code)))
+        return [(w if self.decoder.is_fed(number) else w.bfloat16(), b) for number, (w, b) in layers]
+
+    @torch.no_grad()
+    def _values(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None
+    ) -> Float[Tensor, "n"]:
+        if shape is not None:
+            shape = padded_rows(shape)
+        values = self._run(layers, padded_rows(points), shape).float()
+        return values if len(values) == len(points) else values[: len(points)]
+
+    def _run(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
+    ) -> Float[Tensor, "n"]:
+        if shape is not None:
+            layers = [(weight, bias if bias.dim() == 1 else bias[shape]) for weight, bias in layers]
+        with torch.autocast(points.device.type, torch.bfloat16):
+            return self.decoder._run(layers, points)
+
+
+def padded_rows(rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "m *_"]:
+    """With rows of zeros after them, up to a multiple of `ROWS`, where they are not `MANY`."""
+    missing = -len(rows) % ROWS if len(rows) < MANY else 0
+    return pad(rows, (0, 0) * (rows.dim() - 1) + (0, missing)) if missing else rows
+
+
+class PackedDecoder(BFloat16Decoder):
+    """As right as autocast, in half the time.
+
+    Weights are laid out once, not at every product, and a product adds its bias and bends by itself.
+    """
+
+    @staticmethod
+    def has(decoder: Decoder) -> bool:
+        """Whether it has a decoder's layers: none normed, not all fed, nor the last; and PyTorch the products."""
+        specs = decoder.specs
+        normed = bool(specs.norm_layers) and not specs.weight_norm
+        other = normed or specs.xyz_in_all or len(specs.dims) in specs.latent_in or decoder.training
+        return not other and torch.backends.mkldnn.is_available() and hasattr(PRODUCTS, "_linear_pointwise")
+
+    @torch.no_grad()
+    def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
+        """Those of a field; of the ones that code and points enter, only what multiplies points, transposed."""
+        code = self.decoder.checked(code)
+        return [self._folded(*layer, code) if self.decoder.is_fed(k) else layer for k, layer in enumerate(self._layers)]
+
+    def _folded(self, weight: Tensor, bias: Tensor, code: Tensor) -> Layer:
+        by_code = weight[:, -self._fed : -3]
+        folded = F.linear(code, by_code, bias) if code.dim() > 1 else torch.addmv(bias, by_code, code)
+        return weight[:, -3:].t(), folded
+
+    def _run(
+        self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
+    ) -> Float[Tensor, "n"]:
+        x, last = _placed(layers[0], points, shape, then="relu"), len(layers) - 1
+        for number, weight in enumerate(self._weights, 1):
+            if self.decoder.is_fed(number):
+                placed = _placed(layers[number], points, shape)
+                x = PRODUCTS._linear_pointwise.binary(x, placed, weight, None, "add").relu_()
+            else:
+                x = _product(x, weight, layers[number][1], "relu" if number < last else "none")
+        return self.decoder.ended(x[:, 0])
+
+    @torch.no_grad()
+    def slopes(
+        self, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
+    ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
+        """Exact values, and their derivatives by the point and by the code, rounded on the way back alone."""
+        layers, on, rows = self.decoder.folded(self.decoder.checked(code)), [], padded_rows(points)
+        x = rows[:, :0]
+        for number, layer in enumerate(layers):
+            x = F.linear(torch.cat([x, rows], dim=1) if self.decoder.is_fed(number) else x, *layer)
+            if number < len(layers) - 1:
+                on.append(x.relu_().sign().bfloat16())
+        x, by_units = x[:, 0], layers[-1][0].expand(len(rows), -1)
+        for _ in range(2 if self.decoder.specs.use_tanh else 1):
+            x = x.tanh()
+            by_units = by_units * (1 - x.square())[:, None]
+        by_fed = rows.new_zeros(len(rows), self._fed)
+        for number in range(len(on) - 1, -1, -1):
+            by_units = by_units.bfloat16().mul_(on[number])
+            units, fed = self._weights_back[number]
+            if fed is not None:
+                by_fed += _product(by_units, fed)
+            if units is not None:
+                by_units = _product(by_units, units)
+        by_code, by_point = by_fed[: len(points)].split([self._fed - 3, 3], dim=1)
+        return x[: len(points)], by_point, by_code
+
+    @cached_property
+    def _layers(self) -> list[Layer]:
+        """Weights, and biases in the precision that they are added in."""
+        linears = [getattr(self.decoder, f"lin{layer}") for layer in range(self.decoder.depth)]
+        layers = [(linear.weight, linear.bias) for linear in linears]
+        return [(w, b if self.decoder.is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
+
+    @cached_property
+    def _weights(self) -> list[Tensor]:
+        """Of all layers but the first, without what multiplies code and points, as oneDNN has them for a product."""
+        return [_packed(self._of_units(layer)) for layer in range(1, self.decoder.depth)]
+
+    @cached_property
+    def _weights_back(self) -> list[tuple[Tensor | None, Tensor | None]]:
+        """Of all layers but the last, from its outputs to the units before it, and to code and points."""
+        layers = range(self.decoder.depth - 1)
+        units = [_packed(self._of_units(layer).T) if layer else None for layer in layers]
+        fed = [
+            _packed(self._layers[layer][0][:, -self._fed :].T) if self.decoder.is_fed(layer) else None
+            for layer in layers
+        ]
+        return list(zip(units, fed, strict=True))
+
+    @property
+    def _fed(self) -> int:
+        return self.decoder.specs.code_length + 3
+
+    def _of_units(self, layer: int) -> Tensor:
+        """A layer's weights of the units before it."""
+        weight = self._layers[layer][0]
+        return weight[:, : -self._fed] if self.decoder.is_fed(layer) else weight
+
+
+def _packed(weight: Tensor) -> Tensor:
+    return PRODUCTS._reorder_linear_weight(weight.bfloat16().contiguous(), 4 * ROWS)
+
+
+def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, then: str = "none") -> Tensor:
+    return PRODUCTS._linear_pointwise(x, weight, bias, then, [], "")
+
+
+def _placed(
+    layer: Layer, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None, then: str = "none"
+) -> Float[Tensor, "n width"]:
+    """What points, and the codes that are folded into biases, give to a layer; computed in full precision."""
+    weight, bias = layer
+    if shape is not None:
+        bias = bias.index_select(0, shape)
+    product = LINEAR_RELU if then == "relu" else torch.addmm
+    return product(bias, points, weight).bfloat16()
+
+
+def fastest(decoder: Decoder) -> Decoder | BFloat16Decoder:
+    """The decoder as it is, or rounded: on a CPU that multiplies in bfloat16. Others emulate that, and take longer.
+
+    A decoder of another class is asked as it is: it may have another field.
+    """
+    parameter = next(decoder.parameters())
+    if type(decoder) is not Decoder or parameter.device.type != "cpu" or parameter.dtype != torch.float32:
+        return decoder
+    if not _multiplies_in_bfloat16():
+        return decoder
+    return PackedDecoder(decoder) if PackedDecoder.has(decoder) else BFloat16Decoder(decoder)
+
+
+@lru_cache
+def _multiplies_in_bfloat16() -> bool:
+    """As the processor says it, not a stopwatch: so that a fit that is run again ends where it did."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # PyTorch before 2.10 does not tell
+    return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))

@@ -1,0 +1,125 @@
+"""What a reconstruction looks like beside photographs that it was not told: pictures, figures, a page."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import mean
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn import functional as F
+
+from distrace.data.photograph import Photograph, averaged
+from distrace.fields.base import value_and_gradient
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import iou
+from distrace.reconstruction.reconstruct import Reconstruction
+from distrace.reconstruction.terms import coloured
+from distrace.render import Buffers, render
+from distrace.report.charts import curves
+from distrace.report.page import Html, figure, page, paragraph, section, table
+from distrace.report.scene import scene
+from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
+from distrace.training.loss_history import COURSE
+
+AT_ONCE = 1 << 16  # points whose colours are asked for
+FINER = 2  # rays across a pixel: photographs have means over areas
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A photograph and its rendering: how far apart they are, and how they look side by side."""
+
+    name: str
+    psnr: float  # in decibels, over the pixels of the photograph's mask; object that is missing counts as black
+    silhouette_iou: float
+    picture: Picture  # the photograph, the rendering, its normals, the masks
+
+
+@torch.no_grad()
+def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
+    """Renders the object as a photograph's camera sees it, with `size` pixels along the longer side.
+
+    Raises `ValueError` for a photograph without a mask.
+    """
+    view = photograph.at_most(size)
+    buffers, hit, made = seen(state, view)
+    mask, image = view.known_mask, view.image
+    error = (made - image)[mask].square().mean().clamp_min(1e-10)
+    pictures = [
+        colour_picture(torch.where(mask[..., None], image, 0.4 * image)),
+        colour_picture(torch.where(hit[..., None], made, 1.0)),
+        normal_picture(buffers.normal[::FINER, ::FINER], buffers.mask[::FINER, ::FINER], view.camera.T_world_camera),
+        mask_comparison(mask, hit),
+    ]
+    return Judged(photograph.name, -10 * math.log10(float(error)), iou(mask, hit), side_by_side(pictures))
+
+
+@torch.no_grad()
+def seen(
+    state: Reconstruction, view: Photograph
+) -> tuple[Buffers, Bool[Tensor, "height width"], Float[Tensor, "height width 3"]]:
+    """The surface before a photograph's camera, `FINER` in each direction; pixels of which it covers more than half;
+    and their colours, as a camera has them: means over a pixel's area, of which what is not hit is black."""
+    camera = view.camera.resized(float(FINER)).to(state.surface.last.weight.device)
+    buffers = render(state.surface, camera)
+    made = torch.zeros_like(buffers.rays.directions)
+    hits = zip(buffers.points.split(AT_ONCE), buffers.rays.directions[buffers.mask].split(AT_ONCE), strict=True)
+    parts = [coloured(state.surface, state.colour, *some) for some in hits]
+    made[buffers.mask] = torch.cat(parts) if parts else made[:0, 0]
+    covered = averaged(buffers.mask[..., None].cpu().float(), 1 / FINER)[..., 0]
+    return buffers, covered > 0.5, averaged(made.cpu(), 1 / FINER).float()
+
+
+@torch.no_grad()
+def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
+    """The surface as triangles; each vertex has the colour that it shows when looked at from straight above."""
+    mesh = extract_mesh(state.surface, config)
+    vertices = torch.from_numpy(np.asarray(mesh.vertices)).float().to(config.device)
+    parts = []
+    for points in vertices.split(AT_ONCE):
+        _, gradient = value_and_gradient(state.surface, points)
+        parts.append(coloured(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
+    colours = (255 * torch.cat(parts)).round().byte().cpu().numpy()
+    return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
+
+
+def row_of(name: str, method: str, judgements: Mapping[str, Sequence[Judged]], seconds: float) -> dict[str, object]:
+    """A row of the table of photographs: means over views that were held out, for each of some cameras; what these are
+    called follows the names of the numbers."""
+    numbers: dict[str, object] = {}
+    for cameras, views in judgements.items():
+        numbers[f"psnr{cameras}"] = round(mean(view.psnr for view in views), 2)
+        numbers[f"silhouette_iou{cameras}"] = round(mean(view.silhouette_iou for view in views), 4)
+    count = len(next(iter(judgements.values())))
+    return {"object": name, "method": method, **numbers, "views_held_out": count, "seconds": round(seconds)}
+
+
+def reconstruction_page(
+    name: str,
+    held_out: Sequence[Judged],
+    told: Sequence[Judged],
+    course: Mapping[str, Sequence[float]],
+    mesh: trimesh.Trimesh,
+    facts: Mapping[str, str],
+) -> str:
+    """Views that were held out, some that were not, the mesh, and the course of the loss."""
+    about = "The photograph, what is not object dimmed; the rendering; its normals; masks, orange missing, blue extra."
+    return page(
+        f"{name} from photographs",
+        "A surface and its colours, as the weights of two networks: sphere-traced, with exact gradients.",
+        [
+            *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
+            section("Views it was fitted to", *map(_shown, told)),
+            section("In space", scene({"Surface": mesh}, {})),
+            section("Course", curves(course, f"× {COURSE} steps", "mean of a term", True)),
+            section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
+        ],
+    )
+
+
+def _shown(view: Judged) -> Html:
+    return figure(view.picture, f"{view.name}: {view.psnr:.1f} dB, intersection over union {view.silhouette_iou:.3f}")

@@ -1,0 +1,116 @@
+"""3-D views in a page, to turn with the mouse."""
+
+import math
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+import plotly.graph_objects as go
+import trimesh
+from jaxtyping import Float, Int
+from trimesh.visual import ColorVisuals
+
+from distrace.report.charts import PALETTE
+from distrace.report.page import Html
+
+MOST_FACES = 60_000
+MOST_POINTS = 8_000
+DIRECTION = (1.4, 0.8, 0.6)  # of the eye, in plotly's axes
+FIELD_OF_VIEW = math.pi / 4  # plotly's, upright
+ASPECT = 1.5  # a little less than pages have
+MARGIN = 1.08
+
+
+def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
+    """A view to turn, y up, in the colours of the meshes' vertices where they have some.
+
+    Each name stands in the legend, which hides and shows it.
+    """
+    surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
+    points = [
+        _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
+    ]
+    hidden = dict(visible=False)
+    everything = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes.values()), *clouds.values()])
+    camera = dict(eye=dict(zip("xyz", _eye(everything))))
+    layout = go.Layout(
+        template="none",
+        margin=dict(l=0, r=0, t=0, b=0),
+        paper_bgcolor="rgba(0,0,0,0)",
+        modebar=dict(bgcolor="rgba(0,0,0,0)", color="#98a2af", activecolor="#4477aa"),
+        legend=dict(x=0.015, y=0.985, itemsizing="constant", bgcolor="rgba(0,0,0,0)"),
+        scene=dict(xaxis=hidden, yaxis=hidden, zaxis=hidden, aspectmode="data", camera=camera, dragmode="turntable"),
+    )
+    content = str(go.Figure([*surfaces, *points], layout).to_json()).replace("<", "\\u003c")
+    return Html(f'<script type="application/json">{content}</script><div class="scene"></div>')
+
+
+def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+    """From where the box of all points fits into the picture; plotly's unit is the geometric mean of its sides."""
+    sides = np.ptp(_turned(points), axis=0) if len(points) else np.ones(3)
+    sides = np.maximum(sides, 0.01 * max(sides.max(), 1e-9))
+    corners = sides / np.prod(sides) ** (1 / 3) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5)
+    back = np.array(DIRECTION) / np.linalg.norm(DIRECTION)
+    right = np.cross((0, 0, 1), back) / np.hypot(*back[:2])
+    up = np.cross(back, right)
+    half = np.maximum(abs(corners @ up), abs(corners @ right) / ASPECT)
+    return (corners @ back + MARGIN * half / np.tan(FIELD_OF_VIEW / 2)).max() * back
+
+
+def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
+    vertices, faces = _decimated(np.hstack([mesh.vertices, _own_colours(mesh)]), np.asarray(mesh.faces))
+    colours = ["#" + colour.tobytes().hex() for colour in vertices[:, 3:].astype(np.uint8)]
+    light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
+    return go.Mesh3d(
+        **_coordinates(vertices[:, :3]),
+        **dict(zip("ijk", faces.astype(np.int32).T)),
+        name=escape(name),
+        color="#cfc3b5",
+        vertexcolor=colours if vertices.shape[1] > 3 else None,
+        lighting=light,
+        lightposition=dict(x=3, y=-2, z=6),
+        showlegend=True,
+        hoverinfo="skip",
+    )
+
+
+def _own_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+    """Red, green and blue of each vertex; no columns where a mesh has none."""
+    visual = mesh.visual
+    if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
+        return np.asarray(visual.vertex_colors)[:, :3]
+    return np.empty((len(mesh.vertices), 0))
+
+
+def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
+    some = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
+    dot = dict(size=1.8 if len(some) > 1000 else 4, color=colour)
+    return go.Scatter3d(**_coordinates(some), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")
+
+
+def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
+    return dict(zip("xyz", _turned(points).astype(np.float32).T))
+
+
+def _turned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    """World z, x, y as plotly's x, y, z: its turntable turns around its z alone."""
+    return points[:, [2, 0, 1]]
+
+
+def _decimated(
+    vertices: Float[np.ndarray, "n columns"], faces: Int[np.ndarray, "m 3"]
+) -> tuple[Float[np.ndarray, "_ columns"], Int[np.ndarray, "_ 3"]]:
+    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993).
+
+    Whatever else the columns hold than places is averaged with them.
+    """
+    width = np.ptp(vertices[:, :3], axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
+    corners, triangles = vertices, faces
+    while len(triangles) > MOST_FACES:
+        _, cell = np.unique(np.floor(vertices[:, :3] / width).astype(int), axis=0, return_inverse=True)
+        cell = cell.reshape(-1)
+        corners = np.stack([np.bincount(cell, axis) for axis in vertices.T], axis=1) / np.bincount(cell)[:, None]
+        triangles = cell[faces]
+        triangles = triangles[(triangles != np.roll(triangles, 1, axis=1)).all(1)]
+        width *= 1.1
+    return corners, triangles

@@ -1,0 +1,77 @@
+"""The page of a shape found in photographs: each of them beside what was made of it, and how the shape formed."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+import trimesh
+from jaxtyping import UInt8
+
+from distrace.camera import Camera
+from distrace.checkpoints.model import Model
+from distrace.data.photograph import Photograph
+from distrace.fitting.ray_sampling import band
+from distrace.photos.fit_photos import PhotoStep
+from distrace.photos.outlier_views import Agreement
+from distrace.render import Buffers, render
+from distrace.report.charts import curves
+from distrace.report.completion_page import View
+from distrace.report.page import figure, page, paragraph, row, section, table
+from distrace.report.scene import scene
+from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
+
+SHOWN = 8  # views
+SIZE = 224  # pixels, of pictures
+FRAMES = 24  # of the film of the shape forming
+
+
+def views_page(
+    model: Model,
+    views: Sequence[Photograph],
+    steps: Sequence[PhotoStep],
+    agreed: Sequence[Agreement],
+    mesh: trimesh.Trimesh,
+) -> str:
+    """Photographs with the outline of the fitted shape, the shape, and what each view is off by."""
+    last = steps[-1]
+    some = views[:: -(-len(views) // SHOWN)]
+    pictures = [figure(_beside(model, last, view), view.name) for view in some]
+    losses: dict[str, list[float]] = {}
+    for step in steps:
+        losses.setdefault(step.name, []).append(step.loss)
+    cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.doubtful else ""] for view in agreed]
+    lead = f"A shape from {len(views)} photographs, by the model {model.name}. No depth was known."
+    about = "How far colours, from 0 to 1, are from those of the same points in other views: the median."
+    return page(
+        "A shape from photographs",
+        lead,
+        [
+            section("Views", paragraph("Each with the outline of the shape, and the shape."), row(*pictures)),
+            section("In space", scene({"Shape": mesh}, {})),
+            section("Loss", curves(losses, "iteration", "loss", True, last.name)),
+            section("Agreement", paragraph(about), table(["view", "colour", ""], cells)),
+        ],
+    )
+
+
+def forming(model: Model, steps: Sequence[PhotoStep], camera: Camera) -> UInt8[np.ndarray, "frames height width 3"]:
+    """The shape after the steps of the start that was chosen, as a camera sees it."""
+    chosen = [step for step in steps if step.start == steps[-1].start]
+    some = chosen[:: -(-len(chosen) // FRAMES)]
+    pictures = [View.of(_rendered(model, step, camera)).shaded for step in [*some, chosen[-1]]]
+    return np.stack(pictures)
+
+
+def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
+    """The photograph with the outline of the shape, and the shape."""
+    small = view.at_most(SIZE)
+    buffers = _rendered(model, step, view.camera)
+    picture = colour_picture(small.image.cpu())
+    picture[band(buffers.mask, 3).cpu().numpy()] = EXTRA
+    return side_by_side([picture, View.of(buffers).shaded])
+
+
+@torch.no_grad()
+def _rendered(model: Model, step: PhotoStep, camera: Camera) -> Buffers:
+    small = camera.resized(min(1.0, SIZE / max(camera.height, camera.width)))
+    return render(model.field(step.code), step.place.camera_in_object(small))

@@ -1,0 +1,59 @@
+"""A training run on disk: everything needed to go on as if it had not been stopped, in one file."""
+
+import math
+from dataclasses import asdict
+from pathlib import Path
+
+import torch
+
+from distrace.errors import explained
+from distrace.fields.decoder import NetworkSpecs
+from distrace.files import written
+from distrace.training.config import TrainConfig
+from distrace.training.loss_history import COURSE
+from distrace.training.trainer import Training, start
+
+NAME = "checkpoint.pt"
+
+
+def save_training(folder: Path, training: Training, config: TrainConfig, names: list[str]) -> None:
+    """Replaces the run's checkpoint; at no moment is there none."""
+    state = {
+        "step": training.step,
+        "losses": training.losses,
+        "config": asdict(config),
+        "specs": asdict(training.decoder.specs),
+        "names": names,
+        "decoder": training.decoder.state_dict(),
+        "codes": training.codes.detach(),
+        "optimiser": training.optimiser.state_dict(),
+    }
+    with written(folder / NAME) as file:
+        torch.save(state, file)
+
+
+def load_training(folder: Path, names: list[str], device: torch.device) -> tuple[Training, TrainConfig] | None:
+    """The run as it was last saved, with its own configuration; None where there is none.
+
+    Raises `ValueError` for a damaged checkpoint, or one of other shapes.
+    """
+    path = folder / NAME
+    if not path.exists():
+        return None
+    with explained(f"{path} is not a checkpoint of a training run; move it away to start afresh"):
+        state = torch.load(path, map_location=device, weights_only=True)
+        config = TrainConfig(**state["config"])
+        specs = NetworkSpecs(**state["specs"])
+        training = start(len(state["names"]), specs, config, device)
+        training.decoder.load_state_dict(state["decoder"])
+        training.codes.data.copy_(state["codes"])
+        training.optimiser.load_state_dict(state["optimiser"])
+        training.step = state["step"]
+        unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
+        training.losses = state.get("losses", unknown)
+    if state["names"] != names:
+        raise ValueError(
+            f"{path} was trained on {len(state['names'])} files of samples, and now there are {len(names)} or others;"
+            " give another --out to start afresh"
+        )
+    return training, config

@@ -1,0 +1,154 @@
+"""Training a DeepSDF auto-decoder: the network and one code per shape, together (Park et al., CVPR 2019, section 4)."""
+
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+from torch.nn.utils.parametrize import is_parametrized
+
+from distrace.checkpoints.model import Model
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.training.batches import Samples
+from distrace.training.config import TrainConfig
+from distrace.training.cuda_graph import Recorded
+from distrace.training.distillation import Kept
+from distrace.training.loss_history import record
+from distrace.training.losses import clamped_loss, training_loss
+
+
+@dataclass
+class Training:
+    """What a run changes as it goes on, and what a checkpoint holds."""
+
+    decoder: Decoder
+    codes: nn.Parameter  # [shapes, length]
+    optimiser: torch.optim.Adam
+    step: int = 0
+    losses: list[float] = field(default_factory=list)  # the mean of each COURSE steps so far; the last may have fewer
+
+    def record(self, loss: float) -> None:
+        """Counts a step done."""
+        record(self.losses, self.step, loss)
+        self.step += 1
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step done: its loss, and how long it took."""
+
+    step: int
+    loss: float
+    seconds: float
+
+
+def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
+    """A fresh network and codes, from the configuration's seed."""
+    torch.manual_seed(config.seed)
+    decoder = Decoder(specs).to(device)
+    codes = nn.Parameter(config.code_deviation * torch.randn(shapes, specs.code_length).to(device))
+    groups = [{"params": list(decoder.parameters())}, {"params": [codes]}]
+    return Training(decoder, codes, torch.optim.Adam(groups, lr=0.0, fused=True))
+
+
+@torch.no_grad()
+def begin_with(training: Training, names: list[str], model: Model) -> None:
+    """Takes over a model's network, and its codes of shapes of the same names; others begin as `codes_of` tells."""
+    for layer in range(training.decoder.depth):
+        own, learnt = (getattr(decoder, f"lin{layer}") for decoder in (training.decoder, model.decoder))
+        if is_parametrized(own, "weight"):
+            own.weight = learnt.weight.detach()  # weight norm takes it apart
+        else:
+            own.weight.copy_(learnt.weight)
+        own.bias.copy_(learnt.bias)
+    training.codes.copy_(model.codes_of(names))
+
+
+def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept | None = None) -> Iterator[Step]:
+    """Trains in place and yields after every step, from wherever `training` is to the last one.
+
+    What is `kept` counts `config.keep` times. The draw of a step depends on the seed and the step alone: a run that was
+    stopped goes on as if it had not been.
+    """
+    device, step = training.codes.device, partial(_step, training, config, kept)
+    training.decoder.train()
+    _prepare(training.optimiser, device)
+    if device.type == "cuda":
+        step = Recorded(step)
+    while training.step < config.steps:
+        began = time.perf_counter()
+        share = _rate(training.step, config)
+        _set_rates(training.optimiser, (share * config.learning_rate, share * config.code_learning_rate))
+        torch.manual_seed((config.seed << 32) + training.step)
+        shapes, batch = samples.drawn(config.shapes_per_step, config.samples_per_step, config.variant_weight)
+        between = () if kept is None else (kept.drawn(shapes),)
+        training.record(loss := step(shapes.to(device), batch, *between).item())
+        yield Step(training.step, loss, time.perf_counter() - began)
+
+
+def _step(
+    training: Training,
+    config: TrainConfig,
+    kept: Kept | None,
+    shapes: Tensor,
+    batch: Float[Tensor, "shapes n 4"],
+    between: Float[Tensor, "shapes length"] | None = None,
+) -> Tensor:
+    """A step on the samples drawn, and at half of their points on the codes between; the loss of the samples."""
+    codes = training.codes.index_select(0, shapes)
+    rest = config.code_penalty * codes.square().sum(-1).mean()
+    with torch.autocast(batch.device.type, torch.bfloat16, enabled=config.bfloat16, cache_enabled=False):
+        values = training.decoder(batch[..., :3], codes[:, None])
+        if kept is not None and between is not None:
+            points = batch[:, ::2, :3]
+            now, before = training.decoder(points, between[:, None]), kept.values(points, between)
+            rest = rest + config.keep * clamped_loss(now.float(), before.float(), config.clamp)
+    loss = training_loss(values.float(), batch[..., 3], config)
+    training.optimiser.zero_grad()
+    (loss + rest).backward()
+    training.optimiser.step()
+    bound_codes(training.codes, config.code_bound)
+    return loss.detach()
+
+
+def _prepare(optimiser: torch.optim.Adam, device: torch.device) -> None:
+    """Makes the optimiser one whose steps can be recorded, on a GPU, or cannot, whatever it was before."""
+    recorded = device.type == "cuda"
+    for group in optimiser.param_groups:
+        group["capturable"], group["lr"] = recorded, torch.zeros((), device=device) if recorded else 0.0
+
+
+def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
+    for group, rate in zip(optimiser.param_groups, rates, strict=True):
+        if isinstance(group["lr"], Tensor):
+            group["lr"].fill_(rate)  # a recorded step reads it where it lies
+        else:
+            group["lr"] = rate
+
+
+@torch.no_grad()
+def bound_codes(codes: Tensor, bound: float) -> None:
+    """Scales codes that are longer than the bound back to it."""
+    codes.mul_((bound / codes.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0))
+
+
+def _rate(step: int, config: TrainConfig) -> float:
+    """Of the highest one. A trapezium does what a cosine does, and can be prolonged (Hägele et al., NeurIPS 2024)."""
+    left = (config.steps - step) / (config.steps * config.cool_down)
+    return min(1.0, (step + 1) / config.warm_up, left)
+
+
+def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:
+    """Whether this machine trains faster with bfloat16 products: some processors emulate them, and old GPUs."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)  # a few steps are over too soon to tell
+    seconds = {}
+    for bfloat16 in (False, True, False, True):  # the second time of each counts
+        config = TrainConfig(steps=2, bfloat16=bfloat16)
+        random = [torch.rand(4096, 4) * 0.1]
+        run = train(Samples(["random"], random, random).to(device), start(1, specs, config, device), config)
+        seconds[bfloat16] = min(step.seconds for step in run)
+    return seconds[True] < seconds[False]
