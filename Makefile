@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check lock clean
+.PHONY: demo test check results release lock clean
 
 demo: .venv/installed
 	$(BIN)/distrace demo --out out/demo
@@ -13,6 +13,15 @@ check: .venv/installed  ## style and types
 	$(BIN)/ruff check src experiments tests examples
 	$(BIN)/ruff format --check src experiments tests examples
 	$(BIN)/pyright
+
+results: .venv/installed  ## the tables that take under a minute
+	$(BIN)/python -m experiments fields sofas --size 64 --out out/fields
+	$(BIN)/distrace check-gradients sofas --out out/gradient-check
+
+release: .venv/installed check test
+	$(BIN)/python -m pip install --quiet build twine
+	$(BIN)/python -m build
+	$(BIN)/python -m twine check dist/*
 
 # The environment; made again only when what it is made from changes.
 .venv/installed: requirements.lock pyproject.toml
