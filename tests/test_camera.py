@@ -353,3 +353,12 @@ def test_what_differs_in_one_value_or_in_precision_is_not_equal() -> None:
     trace = things()[3]
     assert isinstance(trace, Trace)
     assert trace != replace(trace, setup_evaluations=1)
+
+
+@pytest.mark.parametrize("name", ["focal_mm", "focal_px"])
+def test_the_focal_length_of_an_orbit_keeps_its_gradient(name: str) -> None:
+    focal = torch.tensor(50.0, requires_grad=True)
+    camera = Camera.orbit(30, 20, 4.97, height=8, width=8, **{name: focal})
+    rays = camera.rays()
+    (gradient,) = torch.autograd.grad(rays.directions[0, 0, 0], focal)
+    assert gradient.abs() > 1e-6

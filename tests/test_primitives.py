@@ -152,3 +152,17 @@ def test_sizes_may_require_grad() -> None:
     (by_major,) = torch.autograd.grad(primitives.torus(major, 0.2)(p).sum(), major)
     around = math.hypot(0.6, 0.1) - 0.5
     assert by_major.item() == pytest.approx(-around / math.hypot(around, 0.9))
+
+
+@pytest.mark.parametrize(
+    ("of_lists", "of_tensors"),
+    [
+        (primitives.sphere(0.5, (0.1, -0.2, 0.3)), EXACT["sphere"]),
+        (primitives.plane([1, 2, -2], 0.2), EXACT["plane"]),
+        (primitives.box([0.3, 0.5, 0.2]), EXACT["box"]),
+        (primitives.capsule([-0.3, 0, 0.1], (0.4, 0.2, 0), 0.2), EXACT["capsule"]),
+    ],
+)
+def test_vectors_may_be_lists(of_lists: SDF, of_tensors: SDF) -> None:
+    points = torch.rand(20, 3, dtype=f64, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(of_lists(points), of_tensors(points))

@@ -43,20 +43,21 @@ class Camera(ByValue):
         *,
         height: int = 512,
         width: int = 512,
-        focal_mm: float = 60.0,
+        focal_mm: Number = 60.0,
         sensor_mm: float = 32.0,
-        focal_px: float | None = None,
+        focal_px: Number | None = None,
     ) -> "Camera":
         """Returns a camera at `eye` that sees `target` in its middle and y pointing up.
 
         Points with batch axes give a batch of cameras; tensors that require grad keep their gradients. The focal
-        length is in pixels, or in mm together with the sensor's width in mm. Raises `ValueError` where the eye is at
-        the target, a length is not positive, or shapes do not fit.
+        length, a number or a tensor, is in pixels, or in mm together with the sensor's width in mm. Raises
+        `ValueError` where the eye is at the target, a length is not positive, or shapes do not fit.
         """
         _check_size(height, width)
-        focal = width * focal_mm / sensor_mm if focal_px is None and sensor_mm > 0 else (focal_px or 0.0)
-        if not (focal > 0 and math.isfinite(focal)):
-            given = focal_mm if focal_px is None else focal_px
+        given = focal_mm if focal_px is None else focal_px
+        focal = given if focal_px is not None else width * given / sensor_mm if sensor_mm > 0 else 0.0
+        lengths = torch.as_tensor(focal)
+        if not (lengths.isfinite() & (lengths > 0)).all():
             raise ValueError(f"a focal length of {given} on a sensor of {sensor_mm} was given; both must be positive")
         eye, target = together(eye, target)
         forward = target - eye
@@ -67,8 +68,11 @@ class Camera(ByValue):
         pose = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
         pose[..., :3, :3] = upright(forward / forward.norm(dim=-1, keepdim=True))
         pose[..., :3, 3] = eye
-        intrinsics = pose.new_tensor([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-        return Camera.from_matrices(intrinsics.repeat(*eye.shape[:-1], 1, 1), pose, height, width)
+        middle = pose.new_tensor([[1.0, 0.0, width / 2], [0.0, 1.0, height / 2], [0.0, 0.0, 1.0]])
+        intrinsics = middle.repeat(*eye.shape[:-1], 1, 1)
+        intrinsics[..., 0, 0] = focal
+        intrinsics[..., 1, 1] = focal
+        return Camera.from_matrices(intrinsics, pose, height, width)
 
     @staticmethod
     def orbit(
@@ -78,9 +82,9 @@ class Camera(ByValue):
         *,
         height: int = 512,
         width: int = 512,
-        focal_mm: float = 60.0,
+        focal_mm: Number = 60.0,
         sensor_mm: float = 32.0,
-        focal_px: float | None = None,
+        focal_px: Number | None = None,
         dtype: torch.dtype | None = None,
     ) -> "Camera":
         """Returns a camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el).

@@ -1,7 +1,9 @@
 """Analytic fields: primitives as closures, and combinations of fields (after Quilez, *Distance functions*).
 
-Parameters may be tensors that require grad. Sizes are in the units of the world.
+Parameters may be tensors that require grad; vectors may also be lists or tuples. Sizes are in the units of the world.
 """
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float
@@ -10,24 +12,29 @@ from torch import Tensor
 from distrace.fields.base import SDF
 
 Number = float | Tensor
+Vector = Float[Tensor, "3"] | Sequence[float]
 
 
-def sphere(radius: Number, centre: Float[Tensor, "3"] | None = None) -> SDF:
+def sphere(radius: Number, centre: Vector | None = None) -> SDF:
     """|p − c| − r."""
-    return lambda points: (points if centre is None else points - centre).norm(dim=-1) - radius
+    return lambda points: (points if centre is None else points - _vector(centre, points)).norm(dim=-1) - radius
 
 
-def plane(normal: Float[Tensor, "3"], offset: Number = 0.0) -> SDF:
+def plane(normal: Vector, offset: Number = 0.0) -> SDF:
     """n · p − offset, solid on the side that the normal points away from."""
-    unit = normal / normal.norm()
-    return lambda points: points @ unit - offset
+
+    def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
+        across = _vector(normal, points)
+        return points @ (across / across.norm()) - offset
+
+    return field
 
 
-def box(half_extents: Float[Tensor, "3"]) -> SDF:
+def box(half_extents: Vector) -> SDF:
     """An axis-aligned box around the origin."""
 
     def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        beyond = points.abs() - half_extents
+        beyond = points.abs() - _vector(half_extents, points)
         return _length(beyond.clamp_min(0)) + beyond.amax(-1).clamp_max(0)
 
     return field
@@ -43,13 +50,14 @@ def torus(major: Number, minor: Number) -> SDF:
     return field
 
 
-def capsule(start: Float[Tensor, "3"], end: Float[Tensor, "3"], radius: Number) -> SDF:
+def capsule(start: Vector, end: Vector, radius: Number) -> SDF:
     """All points within `radius` of the segment."""
 
     def field(points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
-        axis = end - start
-        along = ((points - start) @ axis / (axis @ axis)).clamp(0, 1)
-        return _length(points - start - along[..., None] * axis) - radius
+        first = _vector(start, points)
+        axis = _vector(end, points) - first
+        along = ((points - first) @ axis / (axis @ axis)).clamp(0, 1)
+        return _length(points - first - along[..., None] * axis) - radius
 
     return field
 
@@ -93,6 +101,10 @@ def smooth_union(first: SDF, second: SDF, width: Number) -> SDF:
 def rounded(field: SDF, radius: Number) -> SDF:
     """The solid grown by `radius`, its edges round."""
     return lambda points: field(points) - radius
+
+
+def _vector(given: Vector, like: Tensor) -> Float[Tensor, "3"]:
+    return given if isinstance(given, Tensor) else like.new_tensor(given)
 
 
 def _length(vector: Tensor) -> Tensor:
