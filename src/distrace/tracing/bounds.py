@@ -42,7 +42,7 @@ class Occupancy:
         """From the first to the last cell on the way of each ray that may hold surface, and from the first again.
 
         From inf to −inf if none does.
-        Cells are looked at by samples along the ray.
+        Cells are found by samples along the ray.
         """
         cells = self.occupied.shape[-1]
         near, far = lines.in_sphere(1 + 2 / cells)  # of a block, other rays than the middle one may be in the sphere

@@ -12,16 +12,16 @@ from distrace.tracing.images import Lines
 
 Values = Callable[[Lines, Float[Tensor, "*k n"]], Float[Tensor, "*k n"]]
 Schedule = tuple[tuple[int, ...], ...]
-"""In how many places at once rays are looked at, look by look; after each group those that are done are left out."""
-CONES = 5  # looks at the cones of a size
+"""How many samples of each ray a query takes, query by query; after each group the active rays are compacted."""
+CONES = 5  # queries of the cones of one size
 ROUGH: Schedule = ((1, 1), (2, 3))  # of single rays by rough values …
-NEAR: Schedule = ((1,), (1,), (4,), (8,), (16,), (32,), *[(256,)] * 42)  # … and by exact ones after these: some graze
-ALONE: Schedule = (*[(1,)] * 4, *[(2,)] * 2, *[(4,)] * 2, (8,), (16,), (32,), *[(256,)] * 37)  # by these alone
+EXACT: Schedule = ((1,), (1,), (4,), (8,), (16,), (32,), *[(256,)] * 42)  # … and by exact ones after these: some graze
+EXACT_ALONE: Schedule = (*[(1,)] * 4, *[(2,)] * 2, *[(4,)] * 2, (8,), (16,), (32,), *[(256,)] * 37)  # by these alone
 BRACKET = 2  # tolerances: in a shorter bracket the root of the line is taken
-BEHIND = 0.1  # tolerances that a look aims behind a root: a ray ends at what is inside, not at what is near
+OVERSHOOT = 0.1  # tolerances that a query aims behind a root: only a point inside ends a ray
 FLAT = torch.tensor(1e-6)  # no slope is less, so that lines have a root
-Looked = tuple[Int[Tensor, "_"], int]
-"""Rays that were looked at together, and in how many places each."""
+Queried = tuple[Int[Tensor, "_"], int]
+"""Rays that were queried together, and how many samples of each."""
 
 
 class State(NamedTuple):
@@ -29,7 +29,7 @@ class State(NamedTuple):
 
     t: Float[Tensor, "*k n"]
     value: Float[Tensor, "*k n"]  # of f at t
-    at: Float[Tensor, "*k n"]  # where f is looked at next
+    at: Float[Tensor, "*k n"]  # where f is queried next
     root: Float[Tensor, "*k n"]  # of the line through the last two values
     end: Float[Tensor, "n"]  # where the ray is done: beyond is no surface or, after a bracket, a point inside
     least: Float[Tensor, "n"]  # f so far …
@@ -46,13 +46,13 @@ class State(NamedTuple):
         gap: Float[Tensor, "n"],
         tolerance: Float[Tensor, "n"],
     ) -> "State":
-        """Of rays that are clear before t and after an end, once f was looked at there."""
+        """The state of rays that are clear before t and beyond an end, from one query at t."""
         value = values(lines, t)
         at = torch.minimum(t + value.maximum(tolerance), end)  # t may be on the surface
         return State(t, value, at, at, end, value, t, gap, tolerance)
 
 
-PLACED = State._fields.index("end")  # of the facts, so many are of a place that was looked at …
+PLACED = State._fields.index("end")  # so many rows belong to one sample …
 CHANGING = State._fields.index("gap")  # … and so many change
 
 
@@ -80,47 +80,47 @@ def march(
     active: Int[Tensor, "m"],
     schedule: Schedule,
     error: float | None = None,
-) -> list[Looked]:
-    """Looks at the active rays in lock step until they are done, and writes what became of them to `states`.
+) -> list[Queried]:
+    """Marches the active rays in lock step until they are done, and writes their states to `states`.
 
-    Values that are good to an `error` never decide on a hit: a ray that a look does not bring farther is left alone.
+    Values that are good to an `error` never decide on a hit: a ray that a query does not advance is left alone.
     """
     changing = states[:CHANGING]
-    looked = []
+    queried = []
     for group in schedule:
         if not len(active):
             break
         some, last = lines[active], State(*states.index_select(1, active).unbind(0))
-        for places in group[:-1]:
-            last = _looked(last, values, some, places, error)
-        state = _looked(last, values, some, group[-1], error)
+        for samples in group[:-1]:
+            last = _query(last, values, some, samples, error)
+        state = _query(last, values, some, group[-1], error)
         changing.index_copy_(1, active, torch.stack(state[:CHANGING]))
-        looked.append((active, sum(group)))
+        queried.append((active, sum(group)))
         going = state.t < state.end
         active = active[going if error is None else going & (state.t > last.t)]
-    return looked
+    return queried
 
 
-def evaluations(looked: list[Looked], count: int) -> Shaped[Tensor, "n"]:
+def evaluations(queried: list[Queried], count: int) -> Shaped[Tensor, "n"]:
     """How often f was evaluated for each of so many rays."""
-    rays = torch.cat([ray for ray, _ in looked])
-    lengths, places = torch.tensor([(len(ray), places) for ray, places in looked], device=rays.device).unbind(1)
-    return rays.bincount(places.repeat_interleave(lengths), count)
+    rays = torch.cat([ray for ray, _ in queried])
+    lengths, samples = torch.tensor([(len(ray), samples) for ray, samples in queried], device=rays.device).unbind(1)
+    return rays.bincount(samples.repeat_interleave(lengths), count)
 
 
-def _looked(state: State, values: Values, lines: Lines, places: int, error: float | None) -> State:
-    """Looks ahead in several places, as far apart as one would be, and tells what is known after the first to stop at.
+def _query(state: State, values: Values, lines: Lines, samples: int, error: float | None) -> State:
+    """Queries several samples ahead, as far apart as one would be, and returns the state at the first to stop at.
 
-    They fill the rest of the ray evenly where that is short; the last may lie half a step beyond its end. A ray stops
-    where f fell below half of what it was: the line would have a root before the next place.
+    They fill the rest of the ray evenly where that is short; the last may lie beyond its end. A ray stops where f fell
+    below half of what it was: the line would have a root before the next sample.
     """
-    if places == 1:
+    if samples == 1:
         lowest = values(lines, state.at)
         where = state.at
         found, _, _ = _advanced(state, lowest, error)
     else:
-        order = _order(places, state.t.dtype, state.t.device)
-        spread = state.t.lerp(state.end, 1 / (places - 0.5))
+        order = _order(samples, state.t.dtype, state.t.device)
+        spread = state.t.lerp(state.end, 1 / (samples - 0.5))
         first = state.at.minimum(spread).maximum(state.t + state.tolerance)
         along = torch.lerp(state.t, first, order)
         at = along[1:]
@@ -138,15 +138,15 @@ def _looked(state: State, values: Values, lines: Lines, places: int, error: floa
 
 
 @lru_cache
-def _order(places: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "k 1"]:
-    """From 0 to a number of places; kept, as it serves every look."""
-    return torch.arange(places + 1, dtype=dtype, device=device)[:, None]
+def _order(samples: int, dtype: torch.dtype, device: torch.device) -> Float[Tensor, "k 1"]:
+    """From 0 to a number of samples; kept, as it serves every query."""
+    return torch.arange(samples + 1, dtype=dtype, device=device)[:, None]
 
 
 def _advanced(
     state: State, after: Float[Tensor, "*k n"], error: float | None
 ) -> tuple[State, Bool[Tensor, "*k n"], Float[Tensor, "*k n"]]:
-    """What is known after f was looked at, which steps count, and by how much f fell.
+    """The state after a query, which steps count, and by how much f fell.
 
     A step counts if the balls around its ends leave no more than the gap between them. The next one ends at the nearest
     of these: the root of the line through the last two values; where the balls around its ends, by the slope, leave
@@ -167,7 +167,7 @@ def _advanced(
     root = torch.addcdiv(at, after, slope)
     balls = torch.addcdiv(at, torch.add(gap, after, alpha=2), slope + 1)
     limit = torch.where(covered, end, t.lerp(at, 0.5))
-    inside = torch.add(root, tolerance, alpha=BEHIND)
+    inside = torch.add(root, tolerance, alpha=OVERSHOOT)
     following = torch.fmin(torch.fmin(inside, balls), limit)
     moved, value = torch.where(clear, at, t), torch.where(clear, after, before)
     return state._replace(t=moved, value=value, at=following, root=root, end=end), clear, drop

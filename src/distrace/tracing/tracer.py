@@ -14,7 +14,7 @@ from distrace.rays import Rays
 from distrace.tracing.bounds import Occupancy, find_occupancy
 from distrace.tracing.evaluator import Evaluator, cheaper
 from distrace.tracing.images import BRANCH, Pixels, reach
-from distrace.tracing.march import ALONE, BRACKET, NEAR, ROUGH, Looked, State, evaluations, march, march_cones
+from distrace.tracing.march import BRACKET, EXACT, EXACT_ALONE, ROUGH, Queried, State, evaluations, march, march_cones
 from distrace.tracing.sphere_tracing import Outcome, Trace
 
 LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
@@ -83,8 +83,8 @@ def _traced(
         _check(occupancy, evaluator, config.lipschitz)
     evaluator.normalise(occupancy.lipschitz)
     number, span = _spans(evaluator, occupancy, pixels)
-    state, looks = _marched(evaluator, pixels, config.tolerance, number, span)
-    trace = _result(pixels, number, state, span[1], looks, radius)
+    state, counts = _marched(evaluator, pixels, config.tolerance, number, span)
+    trace = _result(pixels, number, state, span[1], counts, radius)
     return replace(trace, setup_evaluations=evaluator.evaluations - int(trace.evaluations.sum())), occupancy
 
 
@@ -115,17 +115,17 @@ def _marched(
     gap, tolerances = (lines.of_view(each).expand_as(t) for each in limits)
     state = State.begun(evaluator.rough, lines, t, far, gap, tolerances)
     states, clear = torch.stack(state), state.value > evaluator.error
-    looked: list[Looked] = [(every, 1)]
+    queried: list[Queried] = [(every, 1)]
     if evaluator.error:
-        looked += march(evaluator.rough, lines, states, every[clear], ROUGH, evaluator.error)
+        queried += march(evaluator.rough, lines, states, every[clear], ROUGH, evaluator.error)
     going, again = states[0] < far, every[~clear]
     if len(again):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
         limits = (each[again] for each in (begin, far, gap, tolerances))
         states[:, again] = torch.stack(State.begun(evaluator.exact, lines[again], *limits))
-        looked.append((again, 1))
+        queried.append((again, 1))
         going = going & (states[1] > -tolerances)
-    looked += march(evaluator.exact, lines, states, every[going], NEAR if evaluator.error else ALONE)
-    return State(*states.unbind(0)), evaluations(looked, len(number))
+    queried += march(evaluator.exact, lines, states, every[going], EXACT if evaluator.error else EXACT_ALONE)
+    return State(*states.unbind(0)), evaluations(queried, len(number))
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
@@ -151,7 +151,7 @@ def _result(
     number: Int[Tensor, "n"],
     state: State,
     far: Float[Tensor, "n"],
-    looks: Shaped[Tensor, "n"],
+    counts: Shaped[Tensor, "n"],
     radius: float,
 ) -> Trace:
     """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
@@ -161,12 +161,12 @@ def _result(
     outcome = outcome.masked_fill(left, int(Outcome.EXHAUSTED))
     outcome = outcome.masked_fill(left & (state.value <= 0), int(Outcome.INSIDE))
     hit = outcome == int(Outcome.HIT)
-    found = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, looks]
+    found = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, counts]
     near, far = pixels.span
     beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
     table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
     table.index_copy_(1, number, torch.stack([each.to(near.dtype) for each in found]))
     table[:2].add_(pixels.start).mul_(radius)
-    distance, closest, outcome, looks = pixels.image(table).unbind(0)
-    return Trace(distance, outcome.long(), closest, closest, looks.long())
+    distance, closest, outcome, counts = pixels.image(table).unbind(0)
+    return Trace(distance, outcome.long(), closest, closest, counts.long())
