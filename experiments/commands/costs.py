@@ -10,7 +10,7 @@ from distrace.benchmarks.measuring import poster_view
 from distrace.cli.bench import finish, rows_of, show
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import origin, progress, start
-from distrace.files import save_text
+from distrace.files import save_json, save_text
 from experiments.costs import fields, growth, pages, solvers
 from experiments.datasets.splits import on_side
 
@@ -64,6 +64,7 @@ class Growth:
             for axis in axes:
                 for row in axis:
                     rows.append(row)
+                    save_json(run.out / "rows.json", rows_of(self.model, rows))
                     bar.advance(f"{row.axis} {row.value}, {row.strategy}: {row.seconds:.2f} s")
         save_text(run.out / "index.html", pages.growth_page(rows))
         finish(run, rows_of(self.model, rows))
