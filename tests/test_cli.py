@@ -495,14 +495,26 @@ BAD = [
 ]
 
 
+def refuses(
+    words: str,
+    message: str,
+    place: dict[str, str],
+    run: Command,
+    capsys: pytest.CaptureFixture,
+    program: str = "distrace",
+) -> None:
+    """What is wrong ends in one line that says so, and leaves no result."""
+    arguments = tuple(word.format(**place) for word in words.split())
+    out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
+    assert message in one_line(run, capsys, (*arguments, *out), program=program)
+    assert not (Path(place["out"]) / "result.json").exists()
+
+
 @pytest.mark.parametrize(("words", "message"), BAD, ids=[words.replace("/", ".") for words, _ in BAD])
 def test_whatever_is_wrong_is_one_line_and_status_two(
     words: str, message: str, place: dict[str, str], run: Command, capsys: pytest.CaptureFixture
 ) -> None:
-    arguments = tuple(word.format(**place) for word in words.split())
-    out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
-    assert message in one_line(run, capsys, (*arguments, *out))
-    assert not (Path(place["out"]) / "result.json").exists()
+    refuses(words, message, place, run, capsys)
 
 
 def test_cuda_is_refused_where_there_is_none(

@@ -15,7 +15,7 @@ from statistics import mean
 import numpy as np
 import pytest
 import torch
-from test_solvers import Spheres
+from spheres import Spheres
 from torch import Tensor
 
 import distrace.cli.train

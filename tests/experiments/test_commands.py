@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import trimesh
-from test_cli import Command, model, names, observation, one_line, place, result
+from test_cli import Command, model, names, observation, place, refuses, result
 from test_cli import run as run_distrace
 from test_train import SPECS
 
@@ -217,7 +217,4 @@ BAD = [
 def test_whatever_is_wrong_is_one_line_and_status_two(
     words: str, message: str, place: dict[str, str], run: Command, capsys: pytest.CaptureFixture
 ) -> None:
-    arguments = tuple(word.format(**place) for word in words.split())
-    out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
-    assert message in one_line(run, capsys, (*arguments, *out), program="python -m experiments")
-    assert not (Path(place["out"]) / "result.json").exists()
+    refuses(words, message, place, run, capsys, "python -m experiments")

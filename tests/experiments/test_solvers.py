@@ -6,32 +6,15 @@ from dataclasses import replace
 import pytest
 import torch
 import trimesh
+from spheres import Spheres
 
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.data.observation import View
-from distrace.fields.batch import BatchField
-from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.fitting.multistart import Step
 from distrace.rays import meet_sphere
 from experiments.costs import solvers
 from experiments.costs.pages import solvers_page
-
-
-class Spheres(Decoder):
-    """The code is the radius and the centre."""
-
-    def __init__(self) -> None:
-        super().__init__(NetworkSpecs(dims=(8,), code_length=4, latent_in=(), norm_layers=()))
-
-    def forward(self, points: torch.Tensor, code: torch.Tensor) -> torch.Tensor:
-        return (points - code[..., 1:]).norm(dim=-1) - code[..., 0]
-
-    def field(self, code: torch.Tensor):
-        return lambda points: self(points, code)
-
-    def fields(self, codes: torch.Tensor) -> BatchField:
-        return BatchField(codes, lambda points, shape: self(points, codes[shape]), self.field)
 
 
 def steps(losses: list[float]) -> Iterator[Step]:

@@ -1,4 +1,1 @@
-"""What the tables of `results/` are made by: experiments, baselines, and their pages.
-
-Nothing but the command line imports it.
-"""
+"""What `distrace bench` measures: strategies of tracing, random views, derivatives; and its pages."""

@@ -7,7 +7,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
-from torch.nn.functional import normalize
 
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
@@ -130,7 +129,7 @@ def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step:
     first = _gradient(evaluator, at, step)
     length = first.norm(dim=-1)
     way = (values / length).clamp_max(2 / CELLS * HALF_DIAGONAL).nan_to_num(0.0)
-    at = at - normalize(first, dim=-1) * way[..., None]
+    at = at - F.normalize(first, dim=-1) * way[..., None]
     steep = torch.cat([length, _gradient(evaluator, at, step).norm(dim=-1)], dim=1).nan_to_num(0.0)
     steepest, least = steep.amax(1, keepdim=True), values[:, 0]
     found = steep.masked_fill(steep < FLAT * steepest, torch.nan).nanquantile(STEEP, dim=1)
