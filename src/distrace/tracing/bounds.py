@@ -21,9 +21,7 @@ MARGIN = 1.1  # × the steepest slope that was measured: what is steeper lies be
 SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
 STEEP = 0.97  # share of these gradients that the bound covers: ReLU networks have a few steep facets
-FLAT = (
-    0.01  # of the steepest gradient: what is flatter is saturated; and of values, that a gradient is worth per radius
-)
+FLAT = 0.01  # of the steepest gradient, and of the least value a radius: what is flatter is saturated
 BAND = 0.018  # radii: a field that is flat wherever it was measured may rise to that within so much of its surface
 
 
