@@ -17,8 +17,10 @@ import torch
 from test_decoder import arrays, deepsdf, randomised
 
 from distrace.checkpoints.model import Model, bundled_models, load_model, save_experiment, save_model
+from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.files import written
+from distrace.prior import prior_of
 
 torch.set_num_threads(1)
 
@@ -83,6 +85,10 @@ DIALECTS = {
     "with a head that predicts stiffness": lambda state: state | {"homogen_network.0.weight": torch.zeros(64, 3)},
     "with a head, DataParallel": lambda state: with_module(state | {"homogen_network.0.bias": torch.zeros(64)}),
     "parameters": lambda state: {key: torch.nn.Parameter(value) for key, value in state.items()},
+    "torch.compile": lambda state: {f"_orig_mod.{key}": value for key, value in state.items()},
+    "compiled within DataParallel": lambda state: with_module({f"_orig_mod.{k}": v for k, v in classic(state).items()}),
+    "a compiled layer": lambda state: {key.replace("lin1.", "lin1._orig_mod.module."): v for key, v in state.items()},
+    "arrays of NumPy": lambda state: {key: value.numpy() for key, value in state.items()},
 }
 
 
@@ -114,8 +120,13 @@ def test_files_of_torch_before_1_6_are_read(tmp_path):
         {str(number): code for number, code in enumerate(CODES)},
         torch.nn.Parameter(CODES),
         CODES.double(),
+        CODES.numpy(),
+        list(CODES.numpy()),
     ],
-    ids=["n L", "n 1 L", "weight", "embedding", "list", "list of 1 L", "parameter list", "parameter", "double"],
+    ids=[
+        *("n L", "n 1 L", "weight", "embedding", "list", "list of 1 L", "parameter list", "parameter", "double"),
+        *("array", "arrays"),
+    ],
 )
 def test_every_dialect_of_codes_is_the_same_model(tmp_path, latent):
     model = load_model(experiment(tmp_path, latent=latent))
@@ -140,6 +151,49 @@ def test_a_specification_needs_no_more_than_dims_and_a_code_length(tmp_path):
     specs = replace(UNNORMED, latent_in=())
     spec = {"NetworkSpecs": {"dims": list(specs.dims)}, "CodeLength": 3}
     assert_same_fields(load_model(experiment(tmp_path, specs, spec=spec)), specs)
+
+
+@pytest.mark.parametrize("classic_file", [True, False])
+@pytest.mark.parametrize("epoch", [np.int64(7), np.float32(7), np.bool_(True), np.arange(3)], ids=lambda e: str(e.dtype))
+def test_an_epoch_of_numpy_is_no_obstacle(tmp_path, epoch, classic_file):
+    experiment(tmp_path)
+    how = {"_use_new_zipfile_serialization": not classic_file}
+    put(tmp_path / WEIGHTS, {"epoch": epoch, "model_state_dict": weights(SPECS)}, **how)
+    put(tmp_path / LATENTS, {"epoch": epoch, "latent_codes": CODES}, **how)
+    assert_same_fields(load_model(tmp_path))
+
+
+def test_a_specification_may_begin_with_a_byte_order_mark(tmp_path):
+    path = experiment(tmp_path) / "specs.json"
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert_same_fields(load_model(tmp_path))
+
+
+def test_without_codes_there_is_a_decoder_and_a_warning(tmp_path):
+    (experiment(tmp_path) / LATENTS).unlink()
+    with pytest.warns(DoubtfulResult, match=f"{LATENTS} is missing: the model has a decoder, and no codes"):
+        model = load_model(tmp_path)
+    assert model.codes.shape == (0, 3)
+    assert model.shapes == ()
+    expected = deepsdf(SPECS, arrays(randomised(SPECS)), CODES[1].numpy(), POINTS.numpy())
+    np.testing.assert_allclose(model.field(CODES[1])(POINTS), expected, atol=1e-5)
+    assert torch.equal(model.codes_of(["sofa"]), torch.zeros(1, 3)), "training begins at zero"
+    assert torch.equal(prior_of(model.codes).mean, torch.zeros(3)), "the prior is DeepSDF's"
+
+
+STAND_INS = {
+    "Git LFS pointer": b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 7368013\n",
+    "web page": b"\n<!DOCTYPE html>\n<html><title>Sign in</title></html>",
+}
+
+
+@pytest.mark.parametrize("name", STAND_INS)
+@pytest.mark.parametrize("file", [WEIGHTS, LATENTS, Path("specs.json"), Path("model.safetensors")], ids=str)
+def test_what_lies_in_place_of_a_file_that_was_not_downloaded_is_named(tmp_path, file, name):
+    (experiment(tmp_path) / file).write_bytes(STAND_INS[name])
+    sentence = refused(tmp_path)
+    assert str(tmp_path / file) in sentence
+    assert f"it is a {name}" in sentence
 
 
 def test_null_is_as_good_as_nothing(tmp_path):
@@ -365,8 +419,6 @@ def test_the_pickle_of_these_tests_does_run_where_one_lets_it(tmp_path):
 
 def test_a_checkpoint_that_is_missing(tmp_path):
     experiment(tmp_path)
-    (tmp_path / LATENTS).unlink()
-    assert refused(tmp_path).startswith(f"{tmp_path / LATENTS} is missing: the codes that belong to latest.pth")
     (tmp_path / WEIGHTS).unlink()
     assert refused(tmp_path).startswith(f"{tmp_path / 'ModelParameters'} holds no checkpoint")
     (tmp_path / "ModelParameters").rmdir()

@@ -1,8 +1,12 @@
 """Errors and warnings of one sentence, whatever a library raised underneath."""
 
+import errno
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+
+NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 class DoubtfulResult(UserWarning):
@@ -10,13 +14,20 @@ class DoubtfulResult(UserWarning):
 
 
 @contextmanager
-def explained(sentence: str) -> Iterator[None]:
-    """Anything that goes wrong inside is raised again as `ValueError(sentence)`; Ctrl-C passes through."""
+def explained(sentence: str, file: Path | None = None) -> Iterator[None]:
+    """Raises anything that goes wrong inside again as `ValueError(sentence)`, with its cause.
+
+    The cause is what lies in place of `file`, if that is a Git LFS pointer or a web page; else the error's first
+    sentence. Ctrl-C and a full disk pass through: no file that is read is to blame for them.
+    """
     try:
         yield
     except Exception as error:
-        cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]  # of a library's explanation, the first sentence
+        if isinstance(error, OSError) and error.errno in NO_SPACE:
+            raise
+        cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]
         cause = f"no key {cause}" if isinstance(error, KeyError) else cause
+        cause = (file and _stand_in(file)) or cause
         raise ValueError(f"{sentence} ({cause})" if cause else sentence) from error
 
 
@@ -27,3 +38,14 @@ def about(subject: object) -> Iterator[None]:
         yield
     except ValueError as error:
         raise ValueError(f"{subject}: {error}") from error
+
+
+def _stand_in(file: Path) -> str:
+    """What lies in place of a file that was not downloaded; empty if it is no such thing."""
+    head = b""
+    if file.is_file():
+        with file.open("rb") as content:
+            head = content.read(100).lstrip().lower()
+    if head.startswith(b"version https://git-lfs"):
+        return "it is a Git LFS pointer; `git lfs pull` fetches the file itself"
+    return "it is a web page; download the file itself" if head.startswith((b"<!doctype html", b"<html")) else ""

@@ -8,17 +8,21 @@ import re
 import warnings
 from pathlib import Path
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.errors import explained
+from distrace.errors import DoubtfulResult, explained
 from distrace.fields.decoder import Decoder
 from distrace.files import written
 
 LATEST = "latest.pth"
 BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
 SPLINES = "latent_fields_state_dict"
+PICKLED = np.zeros(1).__reduce__()[0], np.float64(0).__reduce__()[0]  # functions that make an array and a scalar
+NUMPY = [np.ndarray, np.dtype, *{type(np.dtype(kind)) for kind in "?bBhHiIlLqQefd"}]
+NUMPY += [(make, f"numpy.{core}.multiarray.{make.__name__}") for make in PICKLED for core in ("core", "_core")]
 
 
 def write_weights(folder: Path, decoder: Decoder, codes: Float[Tensor, "shapes length"]) -> None:
@@ -30,19 +34,20 @@ def write_weights(folder: Path, decoder: Decoder, codes: Float[Tensor, "shapes l
         torch.save({"epoch": 0, "latent_codes": {"weight": codes.detach().cpu()}}, file)
 
 
-def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "shapes length"]]:
-    """The file that was read, a decoder's weights by our names, and the codes.
+def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "shapes length"] | None]:
+    """The file that was read, a decoder's weights by our names, and the codes, if there is a file of them.
 
-    Raises `ValueError`, in one sentence, for what is missing, or holds something else.
+    Raises `ValueError`, in one sentence, for weights that are missing, and for a file that holds something else.
     """
     weights = _checkpoint(folder / "ModelParameters")
-    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict"):
+    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict", weights):
         stored = _unpickled(weights)["model_state_dict"]
-        state = {_modern(key): tensor.float() for key, tensor in stored.items() if BESIDE not in key}
+        state = {_modern(key): _tensor(value).float() for key, value in stored.items() if BESIDE not in key}
     latent = folder / "LatentCodes" / weights.name
     if not latent.is_file():
-        raise ValueError(f"{latent} is missing: the codes that belong to {weights.name} of ModelParameters")
-    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes"):
+        warnings.warn(f"{latent} is missing: the model has a decoder, and no codes", DoubtfulResult, stacklevel=3)
+        return weights, state, None
+    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes", latent):
         codes = _codes(_unpickled(latent))
     return weights, state, codes
 
@@ -50,7 +55,7 @@ def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "
 def _unpickled(path: Path) -> dict:
     """A file of tensors, and nothing that a pickle could run."""
     try:
-        with warnings.catch_warnings():
+        with warnings.catch_warnings(), torch.serialization.safe_globals(NUMPY):
             warnings.simplefilter("ignore")
             return torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, KeyError):
@@ -73,8 +78,12 @@ def _codes(content: dict) -> Float[Tensor, "shapes length"]:
     if isinstance(stored, dict):
         stored = stored["weight"] if "weight" in stored else list(stored.values())
     if isinstance(stored, list):
-        stored = torch.stack([code.reshape(-1) for code in stored])
-    return stored.detach().float().reshape(len(stored), -1)
+        stored = torch.stack([_tensor(code).reshape(-1) for code in stored])
+    return _tensor(stored).detach().float().reshape(len(stored), -1)
+
+
+def _tensor(value: Tensor | np.ndarray) -> Tensor:
+    return torch.from_numpy(value) if isinstance(value, np.ndarray) else value
 
 
 def _classic(key: str) -> str:
@@ -83,6 +92,6 @@ def _classic(key: str) -> str:
 
 
 def _modern(key: str) -> str:
-    key = key.removeprefix("module.")
+    key = re.sub(r"\b(module|_orig_mod)\.", "", key)  # DataParallel and torch.compile wrap modules at any depth
     key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
     return re.sub(r"weight_v$", "parametrizations.weight.original1", key)

@@ -53,7 +53,8 @@ class Model:
 
     def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
         """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
-        known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
+        known = dict(zip(self.shapes, self.codes, strict=True))
+        mean = self.codes.sum(0) / max(len(self.codes), 1)
         return torch.stack([known.get(shape, known.get(original(shape), mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
@@ -84,7 +85,10 @@ def load_model(name: str | Path) -> Model:
     with explained(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
         decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
     decoder = _filled(decoder, state, source)
-    _check_codes(codes, specs, folder)
+    if codes is None:
+        codes = torch.empty(0, specs.code_length)
+    else:
+        _check_codes(codes, specs, folder)
     names = shapes if len(shapes) == len(codes) else tuple(str(number) for number in range(len(codes)))
     return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
 
@@ -122,8 +126,8 @@ def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
         raise ValueError(
             f"{folder} is not a DeepSDF experiment: it has no specs.json, which names the network's layers"
         )
-    with explained(f"{path} is not a DeepSDF specification"):
-        content = json.loads(path.read_text(encoding="utf-8"))
+    with explained(f"{path} is not a DeepSDF specification", path):
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
         _check_architecture(content)
         network = content["NetworkSpecs"]
         specs = NetworkSpecs(
@@ -153,7 +157,7 @@ def _layers(network: dict, key: str) -> tuple[int, ...]:
 
 
 def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
-    with explained(f"{path} is not a safetensors file of a model"):
+    with explained(f"{path} is not a safetensors file of a model", path):
         tensors = {key: tensor.float() for key, tensor in safetensors.torch.load_file(path).items()}
         codes = tensors.pop("codes")
     return path, tensors, codes

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import trimesh
@@ -14,6 +14,7 @@ from distrace.cli.completion import Surface, Task, complete
 from distrace.cli.console import console, start
 from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.observation import View, load_view
+from distrace.data.solid import load_geometry
 from distrace.errors import explained
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
@@ -86,8 +87,8 @@ class Demo:
 
 
 def _reference(path: Path) -> Surface:
-    with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface"):
-        loaded: Any = trimesh.load(path, process=False)
+    with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
+        loaded = load_geometry(path)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), getattr(loaded, "faces", ())

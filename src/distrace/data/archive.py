@@ -32,7 +32,7 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
     Raises ValueError if `path` is not a whole .deb, or if one of them is neither file nor folder, would land
     outside `folder`, or brings the total above `limit` bytes; what was written before that stays.
     """
-    with explained(f"{path} cannot be unpacked as a Debian package; download the .deb again"):
+    with explained(f"{path} cannot be unpacked as a Debian package; download the .deb again", path):
         with _not_empty(path) as handle:
             packed = _data_tar(handle, path.stat().st_size)
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
@@ -44,7 +44,7 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
 def unpack_zip(path: Path, folder: Path, limit: int = LIMIT) -> None:
     """The files of a zip, written under `folder`; raises ValueError as `unpack_deb` does."""
     sentence = f"{path} cannot be unpacked as a zip; download it again"
-    with explained(sentence), _not_empty(path) as handle, zipfile.ZipFile(handle) as archive:
+    with explained(sentence, path), _not_empty(path) as handle, zipfile.ZipFile(handle) as archive:
         _write(_zip_members(archive), folder, limit)
 
 

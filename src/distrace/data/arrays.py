@@ -18,7 +18,7 @@ UNIT = 1e-4  # by which a unit normal may be too long
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Those of NAMES that an `.npz` holds; nothing in it is unpickled. Raises `ValueError` for any other file."""
-    with explained(f"{path} is not an observation: an .npz with depth, intrinsics and T_world_camera"):
+    with explained(f"{path} is not an observation: an .npz with depth, intrinsics and T_world_camera", path):
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in NAMES if name in archive.files}
         return {name: arrays[name] for name in (*NAMES[:3], *arrays)}  # a KeyError names what is missing

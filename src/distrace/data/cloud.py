@@ -6,13 +6,13 @@ from typing import Any
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import ALMOST
 from distrace.data.observation import View
+from distrace.data.solid import load_geometry
 from distrace.errors import about, explained
 
 
@@ -49,8 +49,8 @@ def load_cloud(path: Path) -> Cloud:
 
     Raises `ValueError`, in one sentence, for what holds none or makes no sense.
     """
-    with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere"):
-        loaded: Any = trimesh.load(path, process=False)
+    with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere", path):
+        loaded = load_geometry(path)
         points = torch.tensor(np.asarray(getattr(loaded, "vertices", np.empty((0, 3)))), dtype=torch.float32)
         normals = _normals(loaded)
     with about(path):

@@ -45,7 +45,7 @@ def read_mask(path: Path) -> Bool[Tensor, "height width"]:
 
 def picture_size(path: Path) -> tuple[int, int]:
     """Height and width in pixels, as stored; raises `ValueError` for a file that is no PNG or JPEG."""
-    with explained(f"{path} cannot be read as a PNG or JPEG image"):
+    with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             return file.height, file.width
 
@@ -61,7 +61,7 @@ def save_mask(path: Path, mask: Bool[Tensor, "height width"]) -> None:
 
 
 def _levels(path: Path) -> Float[Tensor, "height width channels"]:
-    with explained(f"{path} cannot be read as a PNG or JPEG image"):
+    with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             full = 65535 if file.mode in DEEP else 255
             plain = (

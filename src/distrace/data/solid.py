@@ -6,6 +6,7 @@ Barill et al., SIGGRAPH 2018); its surface is the part of the soup across which 
 """
 
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,9 @@ from distrace.errors import explained
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
 OFFSET = 3e-4  # how far from a face its two sides are looked at
 SPACING = 0.02  # between the looks at one face
+LEAST_VOLUME = 1e-9  # of a closed part that has an inside
+OPEN = 0.15  # of a part's area: larger holes make it a sheet
+ASCII = bytes(range(128)) + b"?" * 128  # what each byte becomes
 SMALLEST = 0.01  # faces half inside are split until their edges are this short
 
 
@@ -53,8 +57,8 @@ def load_solid(path: Path) -> Solid:
 
     Raises `ValueError` for a file that cannot be read, or that bounds nothing.
     """
-    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file"):
-        soup = normalised(load_soup(path))
+    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file", path):
+        soup = oriented(normalised(load_soup(path)))
     surface = outer_surface(soup)
     if surface.area < 0.05 * soup.area:
         raise ValueError(f"{path} bounds no solid: only {surface.area / soup.area:.0%} of its faces have an inside")
@@ -79,8 +83,26 @@ def load_soup(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() == ".ac":  # trimesh does not know AC3D
         corners = load_ac3d(path)
         return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    mesh: Any = trimesh.load(path, force="mesh", skip_materials=True, process=False)
+    mesh = load_geometry(path, force="mesh", skip_materials=True)
     return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+
+
+def load_geometry(path: Path, **options: Any) -> Any:
+    """The mesh, scene or cloud of points that trimesh reads from a file, unmerged.
+
+    Bytes of names and comments that are not ASCII become question marks: trimesh takes only UTF-8.
+    """
+    kind = path.suffix.lower().removeprefix(".")
+    if kind not in ("obj", "off", "stl", "ply"):
+        return trimesh.load(path, process=False, **options)
+    content = path.read_bytes()
+    text = len(content)
+    if kind == "stl" and text == 84 + 50 * int.from_bytes(content[80:84], "little"):
+        text = 0  # binary: trimesh ignores its header
+    elif kind == "ply" and b"format ascii" not in content[:1000]:
+        text = content.find(b"end_header")
+    content = content[:text].translate(ASCII) + content[text:]
+    return trimesh.load(BytesIO(content), file_type=kind, process=False, **options)
 
 
 def turned(solid: Solid, degrees: float) -> Solid:
@@ -111,6 +133,45 @@ def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
         raise ValueError("the mesh has no faces, or vertices that are not finite")
     middle = (used.min(0) + used.max(0)) / 2
     return middle, RADIUS / max(np.linalg.norm(used - middle, axis=1).max(), np.finfo(np.float64).tiny)
+
+
+def oriented(soup: trimesh.Trimesh) -> trimesh.Trimesh:
+    """The soup with its closed parts facing outwards: winding numbers of parts that face both ways cancel in an overlap.
+
+    A closed part that faces inwards and lies within others stays as it is: it is a cavity.
+    """
+    part, volume, closed = _parts(soup)
+    faces = np.array(soup.faces)
+    if volume.sum() < 0:
+        faces = faces[:, ::-1]
+        volume = -volume
+    inwards = (closed & (volume < -LEAST_VOLUME))[part]
+    mesh = trimesh.Trimesh(soup.vertices, faces, process=False)
+    if inwards.any():
+        outside = mesh.triangles_center[inwards] - OFFSET * mesh.face_normals[inwards]
+        within = np.bincount(part[inwards], _winding(mesh, outside) > 0.5, len(volume))
+        cavity = within > 0.9 * np.bincount(part[inwards], minlength=len(volume))
+        inwards &= ~cavity[part]
+        faces[inwards] = faces[inwards][:, ::-1]
+        mesh = trimesh.Trimesh(soup.vertices, faces, process=False)
+    return mesh
+
+
+def _parts(soup: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The number of each face's connected part; of each part its signed volume, and whether it is closed but for holes.
+
+    The area vectors of a closed surface add up to zero, those of a sheet to its area.
+    """
+    merged = soup.copy()
+    merged.merge_vertices()
+    part = trimesh.graph.connected_component_labels(merged.face_adjacency, node_count=len(merged.faces))
+    vectors = soup.area_faces[:, None] * soup.face_normals
+    total = np.stack([np.bincount(part, column) for column in vectors.T], axis=1)
+    area = np.bincount(part, soup.area_faces)
+    centre = np.stack([np.bincount(part, column) for column in (soup.triangles_center * soup.area_faces[:, None]).T], 1)
+    towards = soup.triangles_center - (centre / area[:, None])[part]
+    volume = np.bincount(part, (towards * vectors).sum(1) / 3)
+    return part, volume, np.linalg.norm(total, axis=1) < OPEN * area
 
 
 def first_met(

@@ -65,7 +65,7 @@ def load_samples(paths: list[Path]) -> Samples:
     """Reads DeepSDF's `.npz` files. Raises `ValueError` for a file without `pos` and `neg` of shape [n, 4]."""
     outside, inside = [], []
     for path in paths:
-        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg"):
+        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg", path):
             with np.load(path, allow_pickle=False) as archive:
                 pos, neg = (archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg"))
         for name, part in (("pos", pos), ("neg", neg)):

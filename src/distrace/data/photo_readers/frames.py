@@ -41,7 +41,7 @@ class Shots:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Raises `ValueError` for a file that is no JSON, or no object."""
-    with explained(f"{path} cannot be read as JSON"):
+    with explained(f"{path} cannot be read as JSON", path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors write a mark first
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds a {type(content).__name__}; an object with names is needed")

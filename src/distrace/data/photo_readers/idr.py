@@ -34,7 +34,7 @@ def read(folder: Path) -> Shots | None:
 
 
 def _matrices(path: Path) -> dict[str, np.ndarray]:
-    with explained(f"{path} cannot be read as an .npz of matrices"), np.load(path, allow_pickle=False) as archive:
+    with explained(f"{path} cannot be read as an .npz of matrices", path), np.load(path, allow_pickle=False) as archive:
         return {name: archive[name] for name in archive.files if name.startswith(("world_mat_", "scale_mat_"))}
 
 
