@@ -154,7 +154,9 @@ def test_a_specification_needs_no_more_than_dims_and_a_code_length(tmp_path):
 
 
 @pytest.mark.parametrize("classic_file", [True, False])
-@pytest.mark.parametrize("epoch", [np.int64(7), np.float32(7), np.bool_(True), np.arange(3)], ids=lambda e: str(e.dtype))
+@pytest.mark.parametrize(
+    "epoch", [np.int64(7), np.float32(7), np.bool_(True), np.arange(3)], ids=lambda e: str(e.dtype)
+)
 def test_an_epoch_of_numpy_is_no_obstacle(tmp_path, epoch, classic_file):
     experiment(tmp_path)
     how = {"_use_new_zipfile_serialization": not classic_file}

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -22,8 +22,10 @@ import distrace.cli.train
 from distrace.checkpoints.model import Model, load_model, save_experiment, save_model
 from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
+from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import alone
+from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
@@ -79,15 +81,14 @@ def one_sentence(caught: pytest.ExceptionInfo, path: Path) -> None:
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch) -> Iterator:
-    """The command line, in this process; whatever it sets for the process is set back."""
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
+    """The command line, in this process."""
 
     def command(*arguments: str | Path) -> None:
         monkeypatch.setattr(sys, "argv", ["distrace", *map(str, arguments)])
         main()
 
-    yield command
-    torch.set_flush_denormal(False)
+    return command
 
 
 def test_a_tiny_network_learns_a_sphere() -> None:
@@ -367,7 +368,12 @@ def test_a_checkpoint_of_other_samples_ends_in_one_sentence(tmp_path: Path) -> N
         ({"pos": np.ones((5, 4))}, "is not a file of samples"),
         ({"pos": np.ones((5, 4)), "neg": np.ones((5, 3))}, r"neg has shape \[5, 3\]"),
         ({"pos": np.ones((0, 4)), "neg": np.ones((5, 4))}, r"pos has shape \[0, 4\]"),
-        ({"pos": np.full((5, 4), np.nan), "neg": np.ones((5, 4))}, "finite values"),
+        ({"pos": np.full((5, 4), np.nan), "neg": np.ones((5, 4))}, "pos has no row of finite values"),
+        ({"pos": np.ones((5, 4)), "neg": np.ones((5, 4))}, "none of the 5 distances in neg is negative"),
+        ({"pos": -np.ones((5, 4)), "neg": np.ones((5, 4))}, "none of the 5 distances in pos is positive"),
+        ({"pos": 500 * np.ones((5, 4)), "neg": -500 * np.ones((5, 4))}, "points lie 866 from the origin"),
+        ({"pos": np.full((5, 4), 5e-4), "neg": -np.full((5, 4), 5e-4)}, "points lie 0.000866 from the origin"),
+        ({"pos": np.array([[0.5, 0, 0, 90]]), "neg": np.array([[0.5, 0, 0, -50]])}, "up to 90 from the surface"),
         ({"pos": np.array([[None]], dtype=object), "neg": np.ones((5, 4))}, "is not a file of samples"),
         (None, "is not a file of samples"),
     ],
@@ -382,14 +388,79 @@ def test_what_is_no_file_of_samples_ends_in_one_sentence(tmp_path: Path, arrays:
     one_sentence(caught, path)
 
 
+def test_rows_of_nan_are_dropped_and_counted(tmp_path: Path) -> None:
+    samples = of_sphere(0.5).astype(np.float32)
+    inside = samples[:, 3] < 0
+    pos, neg = samples[~inside], samples[inside]
+    pos[3, 3] = np.nan
+    neg[:2, 0] = np.inf
+    np.savez(tmp_path / "ball.npz", pos=pos, neg=neg)
+    with pytest.warns(DoubtfulResult, match="^3 samples that are not finite were dropped$"):
+        loaded = load_samples([tmp_path / "ball.npz"])
+    assert torch.equal(loaded.outside[0], torch.from_numpy(np.delete(pos, 3, axis=0)))
+    assert torch.equal(loaded.inside[0], torch.from_numpy(neg[2:]))
+
+
+def test_samples_count_by_their_sign_on_whichever_side_they_are_stored(tmp_path: Path) -> None:
+    samples = of_sphere(0.5).astype(np.float32)
+    np.savez(tmp_path / "ball.npz", pos=samples[:2000], neg=samples[2000:])
+    loaded = load_samples([tmp_path / "ball.npz"])
+    assert (loaded.outside[0][:, 3] >= 0).all()
+    assert (loaded.inside[0][:, 3] < 0).all()
+    assert len(loaded.outside[0]) + len(loaded.inside[0]) == len(samples)
+
+
+@pytest.mark.parametrize("below", ["SdfSamples", ".", "SdfSamples/ShapeNet"])
+def test_samples_lie_below_a_folder_as_deepsdf_has_them(tmp_path: Path, below: str) -> None:
+    """Beside them are meshes and archives of another kind, which are not learnt."""
+    for name in ("chairs/1a", "chairs/2b", "sofas/1a"):
+        path = tmp_path / "data/SdfSamples/ShapeNet" / f"{name}.npz"
+        write_samples(path, of_sphere(0.5).astype(np.float32))
+    if below == ".":
+        (tmp_path / "data/SurfaceSamples/ShapeNet").mkdir(parents=True)
+        (tmp_path / "data/SurfaceSamples/ShapeNet/1a.ply").touch()
+        np.savez(tmp_path / "data/SurfaceSamples/1a.npz", offset=np.zeros(3))
+    paths = train_samples.sample_files(tmp_path / "data" / below, tmp_path / "out")
+    assert load_samples(paths).names == ["chairs-1a", "chairs-2b", "sofas-1a"]
+
+
+def test_the_precision_that_a_stopwatch_chose_is_saved_before_the_first_step(tmp_path: Path, run, monkeypatch) -> None:
+    samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
+    monkeypatch.setattr(distrace.cli.train, "faster_in_bfloat16", lambda specs, device: True)
+
+    def stopped(*given: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(distrace.cli.train, "run_training", stopped)
+        with pytest.raises(SystemExit):
+            run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
+    assert (checkpoint(out)["step"], checkpoint(out)["config"]["bfloat16"]) == (0, True)
+    monkeypatch.setattr(distrace.cli.train, "faster_in_bfloat16", lambda specs, device: False)
+    run("train", samples, "--out", out, "--steps", "3")
+    assert json.loads((out / "result.json").read_text())["bfloat16"] is True
+
+
+@pytest.mark.parametrize("before", [False, True])
+def test_denormal_numbers_are_flushed_in_training_and_then_as_they_were(tmp_path: Path, run, before: bool) -> None:
+    torch.set_flush_denormal(before)
+    try:
+        run("train", sample_files(tmp_path / "samples", 0.5), "--out", tmp_path / "model", *TINY[2:], "--steps", "2")
+        with flushed_denormals():
+            assert torch.tensor(1e-40) == 0
+        assert (torch.tensor(1e-40) == 0).item() == before
+    finally:
+        torch.set_flush_denormal(False)
+
+
 def checkpoint(folder: Path) -> dict:
     return torch.load(folder / NAME, weights_only=True)
 
 
 def kill_once_saved(process: subprocess.Popen, folder: Path) -> None:
-    """SIGKILL, as soon as there is something to go on from."""
+    """SIGKILL, as soon as there are steps to go on from."""
     patience = time.monotonic() + 300
-    while not (folder / NAME).exists():
+    while not (folder / "preview.png").exists():
         assert process.poll() is None, "the run ended before it was killed"
         assert time.monotonic() < patience
         time.sleep(0.01)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-import torch
 import tyro
 
 from distrace.cli.common import Every, Flag, Views
@@ -23,6 +22,7 @@ from distrace.reconstruction.run import load_reconstruction, mark, save_reconstr
 from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.report.reconstruction_page import judged
 from distrace.shading import save_png
+from distrace.threads import flushed_denormals
 
 PREVIEWS = 40  # of a run, evenly over its steps; they make its film
 PREVIEWED = 160  # pixels along the longer side
@@ -50,9 +50,9 @@ class Reconstruct:
     save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
     device: str = "cpu"
 
+    @flushed_denormals()
     def run(self) -> None:
         saving = Every(self.save_every)
-        torch.set_flush_denormal(True)
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
         found = masked(load_photographs(self.views))

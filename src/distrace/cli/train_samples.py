@@ -13,10 +13,16 @@ MESH_SAMPLES = 200_000  # of each mesh
 
 
 def sample_files(given: Path, out: Path, splits: Sequence[Path] = ()) -> list[Path]:
-    """Files of a folder of samples, those of splits if any is named; of a folder of meshes, sampled below `out`."""
-    has_samples = any(given.glob("*.npz")) or not has_meshes(given)
-    folder = given if has_samples else _sampled_meshes(given, out / "samples")
+    """Files of a folder of samples, those of splits if any is named; of a folder of meshes, sampled below `out`.
+
+    Samples lie in the folder itself, or below it as DeepSDF has them, in `SdfSamples/NAME/CLASS`.
+    """
+    folder = given / "SdfSamples" if (given / "SdfSamples").is_dir() else given
     paths = sorted(folder.glob("*.npz"))
+    if not paths and has_meshes(folder):
+        folder = _sampled_meshes(folder, out / "samples")
+        paths = sorted(folder.glob("*.npz"))
+    paths = paths or sorted(folder.rglob("*.npz"))
     if splits:
         learnt = {shape.name for split in splits for shape in read_split(split) if shape.split == "train"}
         wanted = learnt.union(split.stem for split in splits)  # procedural shapes are called sofas~1

@@ -1,6 +1,7 @@
 """A catalogue of meshes: what each is, who made it, and under which licence; as a table beside the unpacked files."""
 
 import csv
+import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -8,6 +9,7 @@ from pathlib import Path
 
 from distrace.data.debian import fetch
 from distrace.errors import explained
+from distrace.files import save_text
 
 COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
 
@@ -39,9 +41,10 @@ def listed(
 def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
     """The meshes as a table in UTF-8 CSV, one row each; ValueError if `path` cannot be written."""
     rows = ((m.category, m.name, m.creator, m.licence, m.package, m.path.as_posix()) for m in meshes)
-    sentence = f"{path} cannot be written; choose another --out"
-    with explained(sentence), path.open("w", newline="", encoding="utf-8") as file:
-        csv.writer(file, lineterminator="\n").writerows((COLUMNS, *rows))
+    table = io.StringIO()
+    csv.writer(table, lineterminator="\n").writerows((COLUMNS, *rows))
+    with explained(f"{path} cannot be written; choose another --out"):
+        save_text(path, table.getvalue())
 
 
 def summary(meshes: Sequence[Mesh]) -> str:

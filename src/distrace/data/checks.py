@@ -1,5 +1,6 @@
 """Whether a camera and what it saw can be of a shape in the unit sphere; if not, what else they may be meant to be."""
 
+import warnings
 from dataclasses import replace
 
 import torch
@@ -7,18 +8,21 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.errors import DoubtfulResult
 from distrace.pixels import thinned
 
 WIDEST = 160.0  # degrees that a pinhole camera may see
 OBLONG = 4.0  # times that a pixel may be as long as wide
-COARSER = 2.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
+COARSER = 1.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
+OFF_CENTRE = 0.2  # of an image: a principal point that far from the middle may be of another resolution …
+EVENLY = 0.1  # … if it is about as far along both sides: the logarithm of the ratio
 RATHER = 0.02  # as frequent: a mask with so few of the depths within is none of this object
 ALMOST = 1.2  # radii: what lies so far from the middle, in the median, is no shape in the unit sphere
 MOST = 100_000  # pixels that are looked at
 
 
 def check_intrinsics(camera: Camera) -> None:
-    """Raises `ValueError` where they are no pinhole camera's of this image."""
+    """Raises `ValueError` where they are no pinhole camera's of this image; warns where they may be another image's."""
     size, across = camera.intrinsics.new_tensor([camera.width, camera.height]), camera.intrinsics
     (fx, fy), middle = across.diagonal()[:2].tolist(), across[:2, 2] / size
     image = f"an image of {camera.height} × {camera.width} pixels"
@@ -27,9 +31,12 @@ def check_intrinsics(camera: Camera) -> None:
         raise ValueError(f"a focal length of {fx:.4g} pixels sees {angle:.0f}° in {image}; intrinsics are in pixels")
     if not 1 / OBLONG < fx / fy < OBLONG:
         raise ValueError(f"focal lengths of {fx:.4g} and {fy:.4g} pixels were given; they cannot differ so much")
-    if middle.min() > COARSER / 2 and (middle[0] / middle[1]).log().abs() < 0.1:
+    if (middle[0] / middle[1]).log().abs() < EVENLY and (middle - 0.5).abs().min() > OFF_CENTRE:
         point = " × ".join(f"{2 * length:.4g}" for length in across[:2, 2].flip(0).tolist())
-        raise ValueError(f"the intrinsics are for an image of {point} pixels, and this is {image}; scale them with it")
+        sentence = f"the intrinsics are for an image of {point} pixels, and this is {image}; scale them with it"
+        if middle.min() > COARSER / 2:
+            raise ValueError(sentence)
+        warnings.warn(f"if this is no part of an image, {sentence}", DoubtfulResult, stacklevel=4)
 
 
 def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height width"]) -> None:

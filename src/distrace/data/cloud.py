@@ -1,5 +1,6 @@
 """Points of a surface, as a scanner gives them: no camera, perhaps normals. The file form is PLY."""
 
+import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,7 +14,7 @@ from distrace.camera import Camera
 from distrace.data.checks import ALMOST
 from distrace.data.observation import View
 from distrace.data.solid import load_geometry
-from distrace.errors import about, explained
+from distrace.errors import DoubtfulResult, about, explained
 
 
 @dataclass(frozen=True)
@@ -47,15 +48,28 @@ class Cloud:
 def load_cloud(path: Path) -> Cloud:
     """Reads points, or a mesh's vertices, and their normals where the file has them.
 
-    Raises `ValueError`, in one sentence, for what holds none or makes no sense.
+    Points that are not finite, or whose normals have no direction, are dropped, and a `DoubtfulResult` says how many.
+    Raises `ValueError`, in one sentence, for what holds no point or makes no sense.
     """
     with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere", path):
         loaded = load_geometry(path)
         points = torch.tensor(np.asarray(getattr(loaded, "vertices", np.empty((0, 3)))), dtype=torch.float32)
         normals = _normals(loaded)
     with about(path):
-        if not len(points) or not torch.isfinite(points).all():
-            raise ValueError(f"it has {len(points)} points, some perhaps not finite; some, and finite ones, are needed")
+        usable = points.isfinite().all(-1)
+        if not usable.any():
+            raise ValueError(f"it has {len(points)} points, and none that is finite")
+        if normals is not None:
+            directed = normals.any(-1)
+            if (usable & directed).sum() < usable.sum() / 2:
+                normals = None
+                _warn(f"{path}: most of its normals have no direction, and none is used")
+            else:
+                usable &= directed
+        if not usable.all():
+            _warn(f"{path}: {(~usable).sum()} points that are not finite, or whose normals are not, were dropped")
+        points = points[usable]
+        normals = None if normals is None else normals[usable]
         away = points.norm(dim=-1).median().item()
         if away > ALMOST or away < ALMOST / 100:
             raise ValueError(
@@ -65,14 +79,18 @@ def load_cloud(path: Path) -> Cloud:
     return Cloud(points, normals)
 
 
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, DoubtfulResult, stacklevel=4)
+
+
 def _normals(loaded: Any) -> Float[Tensor, "n 3"] | None:
-    """Those of the file, of unit length; a mesh's are not made up."""
+    """Those of the file, of unit length, or zero where they have no direction; a mesh's are not made up."""
     vertices = loaded.metadata.get("_ply_raw", {}).get("vertex", {})
     names = ("nx", "ny", "nz")
     if not set(names) <= set(vertices.get("properties", ())):
         return None
     columns = [np.asarray(vertices["data"][name]).reshape(-1) for name in names]
     normals = torch.tensor(np.stack(columns, axis=-1), dtype=torch.float32)
-    if not torch.isfinite(normals).all() or (normals.norm(dim=-1) < 1e-6).any():
-        raise ValueError("some normals have no direction")
+    length = normals.norm(dim=-1, keepdim=True)
+    normals = torch.where((length > 1e-6) & length.isfinite(), normals, 0.0)
     return torch.nn.functional.normalize(normals, dim=-1)

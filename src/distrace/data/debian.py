@@ -61,7 +61,7 @@ def unpacked(
     if home.exists() and not stamp.is_file():
         raise ValueError(f"{home} exists and is not an unpacked catalogue; move it or choose another --out")
     partial = folder / f".{package}.partial"
-    shutil.rmtree(partial, ignore_errors=True)
+    _remove(partial)
     content = partial / "package"
     unpack_deb(deb, content, below=(below, DOCUMENTS) if below else ())
     arrange(content / below, partial)
@@ -69,5 +69,13 @@ def unpacked(
         licences.replace(partial / "copyright")
     shutil.rmtree(content)
     (partial / _STAMP).write_text(source)
-    shutil.rmtree(home, ignore_errors=True)
+    _remove(home)
     return partial.replace(home)
+
+
+def _remove(path: Path) -> None:
+    """A folder with all that is in it; of a link only the link."""
+    if path.is_symlink() or path.is_file():
+        path.unlink()
+    elif path.exists():
+        shutil.rmtree(path)

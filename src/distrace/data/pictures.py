@@ -13,11 +13,12 @@ from distrace.files import written
 
 FORMATS = ("PNG", "JPEG")
 PLAIN = ("L", "LA", "RGB", "RGBA")
+GREY = 0.1  # difference between the channels of a grey, at most
 DEEP = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
 
 
 def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"] | None]:
-    """Colours from 0 to 1 as they are stored, and where alpha is more than half (None where there is no alpha).
+    """Colours from 0 to 1 as they are stored, and where alpha is more than half of its largest (None where there is no alpha).
 
     The orientation in EXIF is left alone, as cameras are given for the pixels as they are stored. Of 16-bit colour
     the upper eight bits are read. Raises `ValueError` for a file that is no PNG or JPEG, or is cut off.
@@ -25,21 +26,32 @@ def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tens
     levels = _levels(path)
     channels = levels.shape[-1]
     colour = levels[..., :3] if channels >= 3 else levels[..., :1].expand(-1, -1, 3)
-    return colour.contiguous(), levels[..., -1] > 0.5 if channels in (2, 4) else None
+    return colour.contiguous(), _opaque(levels[..., -1]) if channels in (2, 4) else None
+
+
+def _opaque(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
+    """Where alpha is more than half, also if it is 0 and 1 in levels of 255."""
+    return alpha > min(0.5, max(alpha.max().item() / 2, 1e-6))
 
 
 def read_mask(path: Path) -> Bool[Tensor, "height width"]:
-    """Where the mean of the colours, and alpha if there is one, are more than half.
+    """Where any colour is more than half of the brightest, and alpha, if there is one, is more than half.
 
-    Raises `ValueError` as `read_picture` does, and for a mask of 0 and 1 in levels of 255, which looks all black.
+    So a mask may be white, in the colour of a label, or in alpha alone. Raises `ValueError` as `read_picture` does, and
+    for a grey mask of 0 and 1 in levels of 255, which looks all black.
     """
     colour, alpha = read_picture(path)
-    if 0 < colour.max() <= 0.5:
+    if alpha is not None and (colour == colour[0, 0]).all():
+        return alpha
+    level = colour.amax(-1)
+    brightest = level.max().item()
+    grey = (level - colour.amin(-1)).max() < GREY
+    if grey and 0 < brightest <= 0.5:
         raise ValueError(
-            f"{path} is nowhere brighter than {255 * colour.max().item():.0f} of 255; a mask is white where the object"
-            " is, and black elsewhere"
+            f"{path} is nowhere brighter than {255 * brightest:.0f} of 255; a mask is white where the object is, and"
+            " black elsewhere"
         )
-    bright = colour.mean(-1) > 0.5
+    bright = level > (0.5 if grey else brightest / 2)
     return bright if alpha is None else bright & alpha
 
 

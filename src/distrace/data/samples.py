@@ -34,6 +34,12 @@ class Doubt:
     lost: float = 0.0  # share of what is seen of the mesh that bounds no solid
     thin: float = 0.0  # share of the surface behind which the solid ends at once
 
+    def is_of(self, name: str) -> bool:
+        """Whether it is the report on a shape of that name, with values of the right types, as JSON has them."""
+        shares = (self.outer_area, self.doubtful, self.lost, self.thin)
+        rest = isinstance(self.usable, bool) and isinstance(self.reason, str) and isinstance(self.faces, int)
+        return self.name == name and rest and all(isinstance(share, int | float) for share in shares)
+
 
 def sample(solid: Solid, count: int, seed: int, near: float = NEAR) -> Float[np.ndarray, "count 4"]:
     """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""

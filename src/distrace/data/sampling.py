@@ -101,10 +101,12 @@ def _earlier(job: Job) -> Doubt | None:
     if not job.report.exists() or not job.mesh.is_file():
         return None
     with explained(f"{job.report} is not what `sample` leaves of a shape; remove it to sample the shape anew"):
-        kept = json.loads(job.report.read_text())
-        before, now = kept.pop("settings"), job.settings()
-        report = Doubt(**kept)
-    others = [name for name, value in now.items() if before.get(name) != value]
+        content = json.loads(job.report.read_text())
+        before = dict(content.pop("settings"))
+        report = Doubt(**content)
+        if not report.is_of(job.shape.name):
+            raise ValueError("its values are of other kinds, or of another shape")
+    others = [name for name, value in job.settings().items() if before.get(name) != value]
     if others:
         raise ValueError(
             f"{job.out} has samples of {job.shape.name} with another {', '.join(others)}; give another --out"

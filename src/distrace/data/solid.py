@@ -136,7 +136,7 @@ def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
 
 
 def oriented(soup: trimesh.Trimesh) -> trimesh.Trimesh:
-    """The soup with its closed parts facing outwards: winding numbers of parts that face both ways cancel in an overlap.
+    """The soup with its closed parts facing outwards: where parts overlap, winding numbers of both signs cancel.
 
     A closed part that faces inwards and lies within others stays as it is: it is a cavity.
     """

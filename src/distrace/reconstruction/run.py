@@ -1,5 +1,6 @@
 """A reconstruction on disk: everything needed to go on as if it had not been stopped, in one file."""
 
+import operator
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -64,8 +65,10 @@ def load_reconstruction(
             state.colour.load_state_dict(kept["colour"])
             state.steps_of_views.data.copy_(kept["steps_of_views"])
             state.optimiser.load_state_dict(kept["optimiser"])
-            for name in ("step", "seconds", "evaluations", "course"):
-                setattr(state, name, kept[name])
+            state.step = operator.index(kept["step"])
+            state.seconds = float(kept["seconds"])
+            state.evaluations = operator.index(kept["evaluations"])
+            state.course = {str(name): [float(value) for value in values] for name, values in kept["course"].items()}
     if others:
         raise ValueError(f"{path} is of a run with other {', '.join(others)}; give the same, or another --out")
     return state

@@ -1,6 +1,7 @@
 """A training run on disk: everything needed to go on as if it had not been stopped, in one file."""
 
 import math
+import operator
 from dataclasses import asdict
 from pathlib import Path
 
@@ -48,9 +49,9 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.decoder.load_state_dict(state["decoder"])
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
-        training.step = state["step"]
+        training.step = operator.index(state["step"])
         unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
-        training.losses = state.get("losses", unknown)
+        training.losses = [float(loss) for loss in state.get("losses", unknown)]
     if state["names"] != names:
         raise ValueError(
             f"{path} was trained on {len(state['names'])} files of samples, and now there are {len(names)} or others;"

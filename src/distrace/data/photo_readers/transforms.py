@@ -14,6 +14,7 @@ from distrace.errors import about
 NAMES = ("transforms.json", "transforms_train.json")
 UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # if terms are zero
 TERMS = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
+OTHER_CAMERAS = ("fisheye", "latlong", "equirectangular", "orthographic", "ortho")
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # its cameras look along −z, with y up
 
 
@@ -44,12 +45,16 @@ def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
 
 
 def _check_distortion(entry: dict[str, Any]) -> None:
-    model = entry.get("camera_model", "OPENCV")
+    model = entry.get("camera_model") or "OPENCV"
     if model not in UNDISTORTED:
         raise ValueError(f"camera_model is {model!r}, and only pinhole cameras are read; undistort the images first")
-    for name in TERMS:
-        if name in entry and _number(entry, name) != 0:
-            raise ValueError(f"{name} is {entry[name]}: the images are distorted; undistort them first, to {name} 0")
+    for name, value in entry.items():
+        if name.removeprefix("is_") in OTHER_CAMERAS and value:
+            raise ValueError(f"{name} is {value}, and only pinhole cameras are read; undistort the images first")
+        if name in TERMS or name.startswith(("ftheta_p", "distortion")):
+            terms = value if isinstance(value, list) else [value]
+            if any(_number({name: term}, name) != 0 for term in terms):
+                raise ValueError(f"{name} is {value}: the images are distorted; undistort them first, to {name} 0")
 
 
 def _intrinsics(entry: dict[str, Any], height: int, width: int) -> np.ndarray:
