@@ -1,8 +1,10 @@
 """The catalogue of furniture, on a tiny package of the same make."""
 
 import csv
+import errno
 import io
 import os
+import shutil
 import tarfile
 import zipfile
 from pathlib import Path
@@ -95,6 +97,39 @@ def test_the_summary_counts_what_is_left_out(deb, tmp_path):
     assert text.startswith("4 meshes (2 other, ")
     assert "3 CC0-1.0" in text
     assert left_out(tmp_path) == 3
+
+
+def test_a_link_in_place_of_the_table_or_of_what_is_unpacked_is_replaced_not_followed(deb, tmp_path):
+    out, elsewhere = tmp_path / "out", tmp_path / "elsewhere"
+    out.mkdir()
+    elsewhere.mkdir()
+    (elsewhere / "passwd").write_text("root")
+    (out / "shapes.csv").symlink_to(elsewhere / "passwd")
+    (out / f".{PACKAGE}.partial").symlink_to(elsewhere)
+    (out / PACKAGE).symlink_to(tmp_path / "nowhere")
+    prepare(out, deb)
+    assert {path.name: path.read_text() for path in elsewhere.iterdir()} == {"passwd": "root"}
+    assert not any(path.is_symlink() for path in out.iterdir())
+    assert (out / "shapes.csv").read_text().startswith("category,name")
+
+
+def test_a_table_whose_writing_fails_stays_as_it_was(deb, tmp_path, monkeypatch):
+    meshes = prepare(tmp_path, deb)
+    before = (tmp_path / "shapes.csv").read_text()
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="No space left on device"):
+        write_catalogue(meshes[:1], tmp_path / "shapes.csv")
+    assert (tmp_path / "shapes.csv").read_text() == before
+
+
+def full_disk(*given: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_is_called_full_and_no_download_is_blamed(deb, tmp_path, monkeypatch):
+    monkeypatch.setattr(shutil, "copyfileobj", full_disk)
+    with pytest.raises(OSError, match=r"^\[Errno \d+\] No space left on device$"):
+        prepare(tmp_path / "out", deb)
 
 
 def test_prepare_writes_the_table(deb, tmp_path):

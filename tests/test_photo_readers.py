@@ -26,7 +26,8 @@ from PIL import Image
 
 from distrace.camera import Camera
 from distrace.data.photo_readers.idr import decomposed
-from distrace.data.photographs import load_photographs
+from distrace.data.photographs import load_photographs, notes
+from distrace.errors import DoubtfulResult
 
 OPENGL = np.diag([1.0, -1, -1, 1])
 
@@ -70,6 +71,13 @@ def test_transforms_with_intrinsics_for_each_frame_are_read(tmp_path: Path) -> N
     reads_back(frames(tmp_path), "transforms.json")
 
 
+def test_terms_and_flags_that_say_nothing_are_no_obstacle(tmp_path: Path) -> None:
+    def zero(content: dict) -> None:
+        content.update(is_fisheye=False, camera_model=None, distortion_params=[0, 0.0, 0, 0], ftheta_p0=0)
+
+    reads_back(frames(tmp_path, zero), "transforms.json")
+
+
 def test_transforms_with_one_angle_are_read_and_alpha_is_the_mask(tmp_path: Path) -> None:
     loaded = load_photographs(angles(tmp_path))
     assert loaded.layout == "transforms_train.json"
@@ -109,6 +117,17 @@ FRAMES = {
         lambda content: content.update(camera_model="OPENCV_FISHEYE"),
         ("camera_model", "FISHEYE", "undistort"),
     ),
+    "a fisheye's flag": (frame(is_fisheye=True), ("frames[1]", "is_fisheye is True", "undistort")),
+    "equirectangular": (frame(camera_model="EQUIRECTANGULAR"), ("frames[1]", "EQUIRECTANGULAR", "pinhole")),
+    "orthographic": (frame(camera_model="orthographic"), ("frames[1]", "'orthographic'", "pinhole")),
+    "a panorama's flag": (
+        lambda content: content.update(equirectangular=True),
+        ("frames[0]", "equirectangular is True"),
+    ),
+    "a list of terms": (frame(distortion_params=[0, 0, 0.2, 0]), ("frames[1]", "distortion_params is [0, 0, 0.2, 0]")),
+    "F-theta": (lambda content: content.update(ftheta_p1=0.003, ftheta_p0=0), ("frames[0]", "ftheta_p1 is 0.003")),
+    "words as terms": (frame(distortion_params="none"), ("frames[1]", "distortion_params is 'none'")),
+    "twice as large": (frame(fl_x=60, fl_y=60, cx=30, cy=20), ("frames[1]", "are for an image of 40 × 60 pixels")),
     "no image": (frame(file_path="images/none"), ("frames[1]", "file_path names images/none")),
     "outside": (frame(file_path="images/../../x.png"), ("frames[1]", "file_path", "leaves")),
     "no mask": (frame(mask_path="masks/1.png"), ("frames[1]", "mask_path names masks/1.png")),
@@ -129,14 +148,16 @@ def test_what_is_wrong_with_transforms_is_told(tmp_path: Path, name: str) -> Non
     refused(frames(tmp_path, change), "transforms.json", *words)
 
 
-def model(folder: Path, kind: str, place: str = "sparse/0", name: str = "PINHOLE", points: int = 60) -> Path:
-    """A model of COLMAP, in which all four images see all points, written by COLMAP's own library."""
+def model(
+    folder: Path, kind: str, place: str = "sparse/0", name: str = "PINHOLE", points: int = 60, images: int = 4
+) -> Path:
+    """A model of COLMAP, whose images see all points, written by COLMAP's own library."""
     import pycolmap
 
     write_images(folder / "images")
     built = pycolmap.Reconstruction()
     drawn = np.random.default_rng(0).normal(size=(points, 3)) * 0.3
-    for k, camera in enumerate(in_world(), 1):
+    for k, camera in enumerate(in_world()[:images], 1):
         focal_x, focal_y, middle = *camera.intrinsics.diagonal()[:2].tolist(), camera.intrinsics[:2, 2].tolist()
         values = {"PINHOLE": [focal_x, focal_y, *middle], "SIMPLE_RADIAL": [focal_x, *middle, 0.1]}[name]
         sensor = pycolmap.Camera(model=name, width=camera.width, height=camera.height, params=values, camera_id=k)
@@ -145,7 +166,7 @@ def model(folder: Path, kind: str, place: str = "sparse/0", name: str = "PINHOLE
         image = pycolmap.Image(f"view{k - 1}.png", np.zeros((points, 2)), k, k)
         built.add_image_with_trivial_frame(image, inverse)
     for k, point in enumerate(WORLD.to_world(torch.from_numpy(drawn)).numpy()):
-        built.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(image, k) for image in range(1, 5)]))
+        built.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(image, k) for image in range(1, images + 1)]))
     (folder / place).mkdir(parents=True, exist_ok=True)
     (built.write_text if kind == "text" else built.write_binary)(folder / place)
     return folder
@@ -158,6 +179,29 @@ def test_models_of_colmap_are_read_and_their_points_tell_the_sphere(tmp_path: Pa
     placement = load_photographs(tmp_path).placement
     assert (placement.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
     assert 0.5 < placement.radius / WORLD.radius < 1.2
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_of_several_models_the_one_with_most_images_is_read(tmp_path: Path, kind: str) -> None:
+    model(tmp_path, kind, "sparse/0", images=2)
+    model(tmp_path, kind, "sparse/1", images=3)
+    with pytest.warns(DoubtfulResult, match=r"sparse/1, the largest of 2 models, has 3 of 4 photographs; the others"):
+        assert [view.name for view in load_photographs(tmp_path).views] == ["view0", "view1", "view2"]
+    model(tmp_path, kind, "sparse/10")
+    reads_back(tmp_path, "COLMAP")
+
+
+def test_images_that_colmap_did_not_place_are_counted(tmp_path: Path) -> None:
+    with pytest.warns(DoubtfulResult, match=r"sparse has 2 of 4 photographs; the others are left out"):
+        assert len(load_photographs(model(tmp_path, "binary", "sparse", images=2)).views) == 2
+
+
+def test_lines_of_images_without_the_empty_ones_are_read(tmp_path: Path) -> None:
+    path = model(tmp_path, "text", points=0) / "sparse/0/images.txt"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(line for line in lines if line.strip()))
+    assert len(path.read_text().splitlines()) < len(lines)
+    reads_back(tmp_path, "COLMAP")
 
 
 def test_models_of_few_points_are_placed_by_their_views(tmp_path: Path) -> None:
@@ -228,6 +272,16 @@ def test_projections_of_idr_are_read(tmp_path: Path) -> None:
     placement = load_photographs(tmp_path).placement
     assert torch.equal(placement.centre, WORLD.centre)
     assert placement.radius == WORLD.radius
+
+
+def test_a_unit_sphere_smaller_than_the_object_is_noted(tmp_path: Path) -> None:
+    """The object is a ball of half the radius of the sphere that is right."""
+    for name, factor, noted in (("right", 1.0, False), ("touching", 0.55, False), ("half as large", 0.25, True)):
+        smaller = scale() @ np.diag([factor, factor, factor, 1])
+        folder = projections(tmp_path / name, **{f"scale_mat_{k}": smaller for k in range(4)})
+        write_masks(folder / "mask")
+        found = notes(load_photographs(folder))
+        assert any("of the object in the masks lies beyond the unit sphere" in note for note in found) == noted, found
 
 
 def test_masks_of_idr_go_with_the_images_in_the_order_of_their_numbers(tmp_path: Path) -> None:

@@ -193,6 +193,13 @@ def test_views_that_look_wrong_are_noted() -> None:
     assert all(sentence.startswith(word) for sentence, word in zip(found, words))
 
 
+def test_masks_that_are_all_black_are_refused(tmp_path: Path) -> None:
+    own(tmp_path)
+    for path in (tmp_path / "masks").iterdir():
+        Image.fromarray(np.zeros_like(np.array(Image.open(path)))).save(path)
+    refused(tmp_path, str(tmp_path), "its 4 masks mark no pixel as object")
+
+
 def temple() -> Path:
     return SHARED / "templeSparseRing"
 

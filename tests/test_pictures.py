@@ -81,6 +81,58 @@ def test_a_mask_of_ones_in_255_is_told_and_an_empty_one_is_one(tmp_path: Path) -
     assert not read_mask(stored(tmp_path, np.zeros((4, 4), np.uint8))).any()
 
 
+SHAPE = np.hypot(*(np.mgrid[:12, :16] - 7.0)) < 4
+
+
+def coloured(mask: np.ndarray, *colour: int, background: int = 0) -> np.ndarray:
+    return np.where(mask[..., None], np.uint8(colour), np.uint8(background)).astype(np.uint8)
+
+
+MASKS = {
+    "white": coloured(SHAPE, 255, 255, 255),
+    "a label of VOC": coloured(SHAPE, 128, 0, 0),
+    "a dark label": coloured(SHAPE, 0, 64, 0),
+    "one pure channel": coloured(SHAPE, 0, 0, 255),
+    "alpha alone, black": coloured(SHAPE, 0, 0, 0, 255),
+    "alpha alone, white": np.dstack([np.full((*SHAPE.shape, 3), 255, np.uint8), SHAPE * np.uint8(255)]),
+    "alpha of 0 and 1": np.dstack([coloured(SHAPE, 255, 255, 255), SHAPE.astype(np.uint8)]),
+    "alpha of 0 and 1, black": np.dstack([np.zeros((*SHAPE.shape, 3), np.uint8), SHAPE.astype(np.uint8)]),
+    "opaque, in a label's colour": np.dstack([coloured(SHAPE, 128, 0, 0), np.full(SHAPE.shape, 255, np.uint8)]),
+    "opaque, alpha of 1": np.dstack([coloured(SHAPE, 255, 255, 255), np.ones(SHAPE.shape, np.uint8)]),
+    "grey and alpha": np.dstack([SHAPE * np.uint8(255), SHAPE * np.uint8(255)]),
+}
+
+
+@pytest.mark.parametrize("name", MASKS)
+def test_a_mask_may_be_in_any_colour_or_in_alpha(tmp_path: Path, name: str) -> None:
+    assert torch.equal(read_mask(stored(tmp_path, MASKS[name])), torch.from_numpy(SHAPE))
+
+
+def test_a_mask_may_be_a_palette_of_labels(tmp_path: Path) -> None:
+    labels = Image.fromarray(SHAPE.astype(np.uint8), mode="P")
+    labels.putpalette([0, 0, 0, 128, 0, 0])
+    labels.save(tmp_path / "labels.png")
+    assert torch.equal(read_mask(tmp_path / "labels.png"), torch.from_numpy(SHAPE))
+
+
+def test_a_mask_in_a_label_s_colour_may_be_a_jpeg(tmp_path: Path) -> None:
+    path = stored(tmp_path, coloured(SHAPE, 200, 0, 0), "a.jpg")
+    assert (read_mask(path).numpy() != SHAPE).sum() <= 6, "pixels of the outline"
+
+
+def test_the_alpha_of_a_photograph_may_be_0_and_1(tmp_path: Path) -> None:
+    rgba = np.dstack([np.full((*SHAPE.shape, 3), 90, np.uint8), SHAPE.astype(np.uint8)])
+    _, mask = read_picture(stored(tmp_path, rgba))
+    assert mask is not None
+    assert torch.equal(mask, torch.from_numpy(SHAPE))
+
+
+def test_a_pointer_of_git_lfs_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\n")
+    with pytest.raises(ValueError, match=r"a\.png cannot be read as a PNG or JPEG image \(it is a Git LFS pointer"):
+        read_picture(tmp_path / "a.png")
+
+
 def test_what_is_no_image_is_told_in_one_sentence(tmp_path: Path) -> None:
     whole = stored(tmp_path, np.random.default_rng(0).integers(0, 256, (64, 64, 3), np.uint8)).read_bytes()
     for content in (b"", b"no image", whole[:2000], whole[:20]):

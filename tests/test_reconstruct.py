@@ -330,6 +330,11 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tm
         load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), marks, CPU)
     with pytest.raises(ValueError, match="of a run with other photographs; give the same, or another --out"):
         load_reconstruction(tmp_path, config, SMALL, [*marks[1:], mark(turned(views[0], 1.0))], CPU)
+    stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    for tampered in ({"course": {"patches": False}}, {"course": 3}, {"step": "five"}, {"seconds": None}):
+        torch.save(stored | tampered, tmp_path / "checkpoint.pt")
+        with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
+            load_reconstruction(tmp_path, config, SMALL, marks, CPU)
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
         load_reconstruction(tmp_path, config, SMALL, marks, CPU)

@@ -257,6 +257,22 @@ def test_samples_of_another_mesh_or_other_settings_are_not_taken_for_these(
         list(sampling.run([damaged], workers=1))
 
 
+@pytest.mark.parametrize(
+    "tampered",
+    [{"settings": "mesh"}, {"settings": 3}, {"usable": "yes"}, {"name": 7}, {"name": "other"}, {"lost": "0"}],
+    ids=str,
+)
+def test_a_report_with_values_of_other_kinds_ends_in_one_sentence(
+    folder: Path, reports: dict[str, Doubt], tmp_path: Path, tampered: dict
+) -> None:
+    (job,) = (job for job in jobs(folder) if job.shape.name == "cube")
+    content = json.loads(job.report.read_text())
+    damaged = replace(job, out=tmp_path)
+    damaged.report.write_text(json.dumps(content | tampered))
+    with pytest.raises(ValueError, match=r"cube.json is not what `sample` leaves of a shape; remove it"):
+        list(sampling.run([damaged], workers=1))
+
+
 def test_a_shape_whose_samples_are_gone_is_sampled_anew(folder: Path, reports: dict[str, Doubt]) -> None:
     (job,) = (job for job in jobs(folder) if job.shape.name == "cube")
     before = read(job.samples())

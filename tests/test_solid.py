@@ -85,6 +85,73 @@ def test_a_cube_drawn_inside_out_is_a_cube(tmp_path: Path) -> None:
     assert solid.distance(np.zeros((1, 3))) == pytest.approx([-CUBE / 2], abs=1e-6)
 
 
+LEG = (0.5, 2, 0.5)
+THROUGH = trimesh.transformations.translation_matrix((0.5, -0.8, 0.5))
+
+
+@pytest.mark.parametrize("suffix", ["ply", "stl"])
+@pytest.mark.parametrize("inverted", [(False, True), (True, False), (True, True)], ids=["leg", "seat", "both"])
+@pytest.mark.parametrize("capped", [True, False])
+def test_what_parts_share_is_inside_also_if_one_is_drawn_inside_out(
+    tmp_path: Path, suffix: str, inverted: tuple[bool, bool], capped: bool
+) -> None:
+    """A leg through a seat: the winding numbers of both must not cancel."""
+    parts = [trimesh.creation.box((2, 0.4, 2)), trimesh.creation.box(LEG, THROUGH)]
+    right = load_solid(stored(tmp_path, trimesh.util.concatenate(parts)))
+    parts[1] = parts[1] if capped else without_top(parts[1])
+    for part, invert in zip(parts, inverted):
+        if invert:
+            part.invert()
+    path = tmp_path / f"parts.{suffix}"
+    trimesh.util.concatenate(parts).export(path)
+    solid = load_solid(path)
+    points = scattered(2000) * 0.6
+    clear = np.abs(right.distance(points)) > 0.02
+    np.testing.assert_array_equal(solid.contains(points)[clear], right.contains(points)[clear])
+
+
+@pytest.mark.parametrize("inverted", [True, False])
+def test_a_cavity_stays_empty(tmp_path: Path, inverted: bool) -> None:
+    inner = trimesh.creation.icosphere(3, 0.5)
+    inner.invert()
+    hollow = trimesh.util.concatenate([trimesh.creation.icosphere(3, 1.0), inner])
+    if inverted:
+        hollow.invert()
+    solid = load_solid(stored(tmp_path, hollow))
+    radii = np.array([0.0, 0.4, 0.6, 0.9])[:, None] * RADIUS
+    assert solid.contains(radii * [[0.0, 0.6, 0.8]]).tolist() == [False, False, True, True]
+
+
+BYTES = b"caf\xe9 \xff\x80"
+
+
+@pytest.mark.parametrize(
+    ("name", "how", "before"),
+    [
+        ("a.obj", {}, b"v "),
+        ("a.off", {}, b"8 12"),
+        ("a.stl", {"file_type": "stl_ascii"}, b"solid"),
+        ("a.ply", {"encoding": "ascii"}, b"element vertex"),
+        ("a.ply", {"encoding": "binary"}, b"element vertex"),
+    ],
+    ids=["OBJ", "OFF", "ASCII STL", "ASCII PLY", "binary PLY"],
+)
+def test_names_and_comments_may_hold_any_bytes(tmp_path: Path, name: str, how: dict, before: bytes) -> None:
+    content = trimesh.creation.box((1, 1, 1)).export(**({"file_type": name[-3:]} | how))
+    content = content.encode() if isinstance(content, str) else content
+    said = {"a.ply": b"comment " + BYTES + b"\n" + before, "a.stl": b"solid " + BYTES}.get(name)
+    said = said or b"# " + BYTES + b"\n" + before
+    assert before in content
+    (tmp_path / name).write_bytes(content.replace(before, said, 1))
+    assert load_solid(tmp_path / name).surface.volume == pytest.approx(CUBE**3, rel=1e-5)
+
+
+def test_a_binary_stl_may_begin_like_text(tmp_path: Path) -> None:
+    content = trimesh.creation.box((1, 1, 1)).export(file_type="stl")
+    (tmp_path / "a.stl").write_bytes((b"solid " + BYTES).ljust(80, b"\xfe") + content[80:])
+    assert load_solid(tmp_path / "a.stl").surface.volume == pytest.approx(CUBE**3, rel=1e-5)
+
+
 def test_a_cube_that_lacks_a_face_keeps_its_inside(tmp_path: Path) -> None:
     solid = load_solid(stored(tmp_path, without_top(trimesh.creation.box((1, 1, 1)))))
     assert solid.surface.area == pytest.approx(5 * CUBE**2, rel=0.01)

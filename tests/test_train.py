@@ -338,15 +338,16 @@ def test_there_is_no_run_to_go_on_with_in_an_empty_folder(tmp_path: Path) -> Non
     assert load_training(tmp_path, ["a"], CPU) is None
 
 
-@pytest.mark.parametrize("damage", ["cut", "words", "empty", "other", "other-network"])
+@pytest.mark.parametrize("damage", ["cut", "words", "empty", "other", "other-network", "losses", "step"])
 def test_a_damaged_checkpoint_ends_in_one_sentence(tmp_path: Path, damage: str) -> None:
     path = tmp_path / NAME
     save_training(tmp_path, start(1, SPECS, CONFIG, CPU), CONFIG, ["a"])
     whole = path.read_bytes()
-    if damage.startswith("other"):
-        state = torch.load(path, weights_only=True)
-        state = {"some": torch.zeros(3)} if damage == "other" else state | {"specs": {"dims": (8, 8)}}
-        torch.save(state, path)
+    changes = {"other-network": {"specs": {"dims": (8, 8)}}, "losses": {"losses": False}, "step": {"step": "some"}}
+    if damage == "other":
+        torch.save({"some": torch.zeros(3)}, path)
+    elif damage in changes:
+        torch.save(torch.load(path, weights_only=True) | changes[damage], path)
     else:
         path.write_bytes({"cut": whole[: len(whole) // 2], "words": b"no checkpoint", "empty": b""}[damage])
     with pytest.raises(ValueError, match="is not a checkpoint of a training run; move it away") as caught:

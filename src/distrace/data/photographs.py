@@ -20,12 +20,16 @@ from distrace.data.placement import among_points, between_axes
 from distrace.data.space_carving import within_masks
 from distrace.errors import about
 from distrace.files import save_json
+from distrace.pixels import thinned
+from distrace.rays import meet_sphere
 
 LAYOUTS = (own, transforms, idr, middlebury, colmap)
 LOOKED_FOR = (
     "views.json, transforms.json, transforms_train.json, cameras_sphere.npz, *_par.txt, and COLMAP's cameras.bin or"
     " cameras.txt in sparse/0, sparse and the folder itself"
 )
+BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
+MOST = 20_000  # pixels of a mask that are examined
 GLARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
 
 
@@ -49,7 +53,10 @@ def load_photographs(folder: Path) -> Photographs:
         raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
     names = _distinct([shot.image.stem for shot in shots.views])
     views = [replace(_photograph(shot), name=name) for shot, name in zip(shots.views, names)]
+    masks = [view.mask for view in views if view.mask is not None]
     with about(folder):
+        if len(masks) == len(views) and not any(mask.any() for mask in masks):
+            raise ValueError(f"its {len(masks)} masks mark no pixel as object; they are white where the object is")
         placement = shots.placement or estimated(views, shots.points)
     placed = [replace(view, camera=_single(placement.camera_to_unit(view.camera))) for view in views]
     return Photographs(tuple(placed), placement, shots.layout, shots.placement is not None)
@@ -76,7 +83,18 @@ def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"]
 
 def notes(photographs: Photographs) -> list[str]:
     """Sentences about views that can be used but look wrong."""
-    return [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
+    found = [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
+    beyond = _beyond([view for view in photographs.views if view.mask is not None and view.mask.any()])
+    if beyond > BEYOND:
+        found.append(f"{beyond:.0%} of the object in the masks lies beyond the unit sphere; give a larger radius")
+    return found
+
+
+def _beyond(views: Sequence[Photograph]) -> float:
+    """The share of the masks' pixels whose rays miss the unit sphere, in the median of the views."""
+    rays = [view.camera.rays(view.camera.pixels()[thinned(view.known_mask, MOST)]) for view in views]
+    shares = [meet_sphere(each).near.isinf().double().mean().item() for each in rays]
+    return float(np.median(shares)) if shares else 0.0
 
 
 def _distinct(names: Sequence[str]) -> list[str]:

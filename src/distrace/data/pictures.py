@@ -18,7 +18,7 @@ DEEP = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
 
 
 def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"] | None]:
-    """Colours from 0 to 1 as they are stored, and where alpha is more than half of its largest (None where there is no alpha).
+    """Colours from 0 to 1 as they are stored, and where alpha is more than half (None where there is no alpha).
 
     The orientation in EXIF is left alone, as cameras are given for the pixels as they are stored. Of 16-bit colour
     the upper eight bits are read. Raises `ValueError` for a file that is no PNG or JPEG, or is cut off.

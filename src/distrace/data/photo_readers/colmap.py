@@ -1,16 +1,18 @@
 """COLMAP's models, text or binary (Schönberger and Frahm, CVPR 2016), read by its own library."""
 
+import shutil
+import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from distrace.data.photo_readers.colmap_files import check_whole
-from distrace.data.photo_readers.frames import Shot, Shots, inside
-from distrace.errors import about, explained
+from distrace.data.photo_readers.colmap_files import check_whole, with_point_lines
+from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, inside
+from distrace.errors import DoubtfulResult, about, explained
 
-FOLDERS = ("sparse/0", "sparse", ".")
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 OBSERVED = 3  # images at least that see a point which is trusted
 
@@ -18,19 +20,46 @@ OBSERVED = 3  # images at least that see a point which is trusted
 def read(folder: Path) -> Shots | None:
     """None where there is no model; raises `ValueError` for one that cannot be read, or is distorted.
 
-    COLMAP's pixel centres are at +0.5, as ours. Images that it did not place are left out.
+    Of several models below `sparse` the one with most images is read. COLMAP's pixel centres are at +0.5, as ours. A
+    `DoubtfulResult` says which images are left out, as no model has them.
     """
-    places = [folder / name for name in FOLDERS]
-    model = next((place for place in places for kind in ("bin", "txt") if (place / f"cameras.{kind}").is_file()), None)
-    if model is None:
+    models = _models(folder)
+    if not models:
         return None
+    read_models = [(model, _reconstruction(model)) for model in models]
+    model, found = max(read_models, key=lambda each: each[1].num_reg_images())  # of equal ones the first
+    placed = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
+    images = sum(path.suffix in SUFFIXES for path in (folder / "images").rglob("*"))
+    if len(placed) < images:
+        of_models = f", the largest of {len(models)} models," if len(models) > 1 else ""
+        sentence = f"{model}{of_models} has {len(placed)} of {images} photographs; the others are left out"
+        warnings.warn(sentence, DoubtfulResult, stacklevel=4)
+    return Shots("COLMAP", tuple(_shot(folder, model, image) for image in placed), points=_points(found))
+
+
+def _models(folder: Path) -> list[Path]:
+    """Folders with a model: those below `sparse`, else `sparse`, else the folder itself."""
+    below = sorted(path for path in folder.glob("sparse/*") if path.is_dir())
+    for places in (below, [folder / "sparse"], [folder]):
+        models = [place for place in places for kind in ("bin", "txt") if (place / f"cameras.{kind}").is_file()]
+        if models:
+            return list(dict.fromkeys(models))
+    return []
+
+
+def _reconstruction(model: Path) -> Any:
+    """What COLMAP's library reads."""
     check_whole(model)
     from pycolmap import Reconstruction  # here, as loading it takes longer than reading most folders
 
     with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
-        found = Reconstruction(model)
-    placed = sorted((image for image in found.images.values() if image.has_pose), key=lambda image: image.name)
-    return Shots("COLMAP", tuple(_shot(folder, model, image) for image in placed), points=_points(found))
+        images = None if (model / "cameras.bin").is_file() else with_point_lines(model / "images.txt")
+        if images is None:
+            return Reconstruction(model)
+        with TemporaryDirectory() as copy:
+            shutil.copytree(model, copy, ignore=shutil.ignore_patterns("*.png", "*.jpg"), dirs_exist_ok=True)
+            (Path(copy) / "images.txt").write_text(images, encoding="utf-8")
+            return Reconstruction(copy)
 
 
 def _shot(folder: Path, model: Path, image: Any) -> Shot:

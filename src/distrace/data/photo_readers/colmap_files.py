@@ -1,4 +1,4 @@
-"""Whether the binary files of a COLMAP model are whole: their records, walked from one to the next.
+"""Whether the files of a COLMAP model are whole: the records of binary ones are walked from one to the next.
 
 COLMAP's own reader takes what is missing from a file that is cut off to be anything, and may read for ever. The format
 is that of *Output format* in COLMAP's documentation; rigs and frames are those of COLMAP 3.12.
@@ -17,6 +17,23 @@ def check_whole(model: Path) -> None:
         path = model / f"{name}.bin"
         if path.is_file() and not _whole(path.read_bytes(), step):
             raise ValueError(f"{path} is cut off or damaged: its records do not end where the file does")
+
+
+def with_point_lines(images: Path) -> str | None:
+    """The text of images.txt with the lines of points that were dropped because they are empty; None if none was."""
+    lines = [line for line in images.read_text(encoding="utf-8").splitlines() if not line.startswith("#")]
+    rows: list[str] = []
+    for line, following in zip(lines, [*lines[1:], None]):
+        rows.append(line)
+        if _describes_image(line) and (following is None or _describes_image(following)):
+            rows.append("")
+    return None if rows == lines else "".join(f"{row}\n" for row in rows)
+
+
+def _describes_image(line: str) -> bool:
+    """Number, pose, camera and name; lines of points are numbers in threes."""
+    words = line.split()
+    return len(words) >= 10 and (len(words) % 3 != 0 or not words[-1].lstrip("-").isdecimal())
 
 
 def _whole(content: bytes, step: Step) -> bool:
