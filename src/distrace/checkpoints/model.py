@@ -165,7 +165,8 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
 
 def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
     if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
-        given, wanted = list(codes.shape), f"[n, {specs.code_length}]"
+        given = list(codes.shape)
+        wanted = f"[n, {specs.code_length}]"
         raise ValueError(f"{folder} has codes of shape {given}, but specs.json asks for {wanted}")
     if not codes.isfinite().all():
         raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
@@ -180,7 +181,8 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
         if key not in expected:
             raise ValueError(f"{source} has {key}, for which specs.json has no place")
         if state[key].shape != expected[key].shape:
-            given, wanted = list(state[key].shape), list(expected[key].shape)
+            given = list(state[key].shape)
+            wanted = list(expected[key].shape)
             raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
         if state[key].layout != torch.strided:
             raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")

@@ -25,7 +25,7 @@ from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
 from distrace.training.distillation import Kept
 from distrace.training.hard_samples import dwelling
-from distrace.training.loss_history import COURSE
+from distrace.training.losses import COURSE
 from distrace.training.trainer import Training, begin_with, faster_in_bfloat16
 from distrace.training.trainer import start as start_training
 from distrace.training.trainer import train as run_training

@@ -81,7 +81,10 @@ def load_surfaces(path: Path) -> tuple[Float[np.ndarray, "materials 3"], list[Su
 
 def _read(lines: Iterator[list[str]], parent: Frame, found: list[Surfaces]) -> None:
     """One object and those in it, whose number comes last."""
-    frame, own, vertices, image = parent, Frame(), np.empty((0, 3)), _Image()
+    frame = parent
+    own = Frame()
+    vertices = np.empty((0, 3))
+    image = _Image()
     for word, *values in lines:
         if word == "data":
             next(lines, None)
@@ -116,7 +119,8 @@ class _Fan:
 
 def _fan(lines: Iterator[list[str]]) -> _Fan | None:
     """A surface's triangles; None of lines, and of what has fewer than three corners."""
-    kind, material = POLYGON, 0
+    kind = POLYGON
+    material = 0
     for words in lines:
         if words[0] == "SURF":
             kind = int(words[1], 16) & 0xF

@@ -63,7 +63,8 @@ def _data_tar(handle: BinaryIO, size: int) -> bytes:
     while header := handle.read(60):
         if len(header) < 60 or header[58:] != b"`\n":
             raise ValueError("it is damaged")
-        name, length = header[:16].decode("ascii").rstrip(" /"), int(header[48:58])
+        name = header[:16].decode("ascii").rstrip(" /")
+        length = int(header[48:58])
         if not 0 <= length <= size - handle.tell():
             raise ValueError("it is cut off")
         if name.startswith("data.tar"):
@@ -99,7 +100,8 @@ def _zip_members(archive: zipfile.ZipFile) -> Iterator[_Member]:
         # Zips from systems without modes leave the kind at 0: then only the trailing slash tells folders.
         kind = stat.S_IFMT(entry.external_attr >> 16)
         plain = kind in (0, stat.S_IFREG, stat.S_IFDIR)
-        is_file, is_folder = plain and not entry.is_dir(), plain and entry.is_dir()
+        is_file = plain and not entry.is_dir()
+        is_folder = plain and entry.is_dir()
         yield _Member(entry.filename, entry.file_size, is_file, is_folder, partial(archive.open, entry))
 
 

@@ -1,4 +1,4 @@
-"""The arrays of an observation's file, made the images and the camera of a view: each is usable or said to be not."""
+"""Reads and checks the arrays of `OBSERVATION.npz`: the images and the camera of a view."""
 
 from pathlib import Path
 

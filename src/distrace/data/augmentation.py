@@ -1,6 +1,6 @@
-"""Other shapes of the same kind: each axis stretched here and pressed together there, so that parts change sizes.
+"""Warped variants of a shape: a random monotonic map of each axis changes the sizes of its parts.
 
-Boxes stay boxes, and what was symmetric stays so. Distances have to be measured anew.
+Boxes stay boxes, and symmetric shapes stay symmetric. Distances change, so variants are sampled like meshes.
 """
 
 import numpy as np
@@ -35,7 +35,8 @@ def warped(solid: Solid, random: np.random.Generator) -> Solid:
         moved = np.stack([np.interp(vertices[:, axis], KNOTS, maps[axis]) for axis in range(3)], axis=1) * mirrored
         return trimesh.Trimesh(moved, faces if mirrored[0] > 0 else faces[:, ::-1], process=False)
 
-    soup, surface = mapped(solid.soup), mapped(solid.surface)
+    soup = mapped(solid.soup)
+    surface = mapped(solid.surface)
     middle, scale = normalised_frame(soup)
     for mesh in (soup, surface):
         mesh.vertices = (mesh.vertices - middle) * scale
@@ -43,7 +44,7 @@ def warped(solid: Solid, random: np.random.Generator) -> Solid:
 
 
 def _axis_map(random: np.random.Generator, even: bool) -> Float[np.ndarray, "knots"]:
-    """Where the knots of an axis go: the integral of a positive density."""
+    """The new coordinates of an axis's knots: the integral of a positive random density."""
     waves = np.arange(1, WAVES + 1)
     phases = np.pi * waves * (KNOTS[:, None] + 1) / 2 + random.uniform(0, 2 * np.pi, WAVES)
     logarithm = np.cos(phases) @ (random.normal(size=WAVES) * LOCAL / np.sqrt(waves))

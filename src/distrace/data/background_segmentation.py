@@ -70,7 +70,8 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
             f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks"
         )
     dark = colours[bright < threshold_li(bright)]
-    mean, whiten = dark.mean(0), np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
+    mean = dark.mean(0)
+    whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
     apart = _apart(colours, mean, whiten)
     low = threshold_li(apart)
     high = max(threshold_otsu(apart), low)
@@ -110,7 +111,8 @@ def _edge(image: np.ndarray) -> np.ndarray:
 
 def _placed_again(photographs: Photographs) -> Photographs:
     """In the sphere around what the masks allow."""
-    views, before = photographs.views, photographs.placement
+    views = photographs.views
+    before = photographs.placement
     sphere = within_masks(*zip(*((view.camera, view.known_mask) for view in views if view.known_mask.any())))
     placed = tuple(replace(view, camera=sphere.camera_to_unit(view.camera)) for view in views)
     there = Placement(before.to_world(sphere.centre), before.radius * sphere.radius)

@@ -49,7 +49,8 @@ def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
 
 def summary(meshes: Sequence[Mesh]) -> str:
     """Counts by category and licence."""
-    categories, licences = _counted(mesh.category for mesh in meshes), _counted(mesh.licence for mesh in meshes)
+    categories = _counted(mesh.category for mesh in meshes)
+    licences = _counted(mesh.licence for mesh in meshes)
     return f"{len(meshes)} meshes ({categories}; {licences})"
 
 

@@ -1,4 +1,4 @@
-"""Whether a camera and what it saw can be of a shape in the unit sphere; if not, what else they may be meant to be."""
+"""Plausibility of an observation of a shape in the unit sphere, and hints at what was probably meant instead."""
 
 import warnings
 from dataclasses import replace
@@ -11,20 +11,22 @@ from distrace.camera import Camera
 from distrace.errors import DoubtfulResult
 from distrace.pixels import thinned
 
-WIDEST = 160.0  # degrees that a pinhole camera may see
-OBLONG = 4.0  # times that a pixel may be as long as wide
+WIDEST = 160.0  # degrees: largest field of view of a pinhole camera
+OBLONG = 4.0  # largest ratio of the two focal lengths
 COARSER = 1.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
 OFF_CENTRE = 0.2  # of an image: a principal point that far from the middle may be of another resolution …
 EVENLY = 0.1  # … if it is about as far along both sides: the logarithm of the ratio
-RATHER = 0.02  # as frequent: a mask with so few of the depths within is none of this object
-ALMOST = 1.2  # radii: what lies so far from the middle, in the median, is no shape in the unit sphere
-MOST = 100_000  # pixels that are looked at
+RATHER = 0.02  # least share of depths within a mask, relative to that beyond it
+ALMOST = 1.2  # radii: largest median distance from the origin of a shape in the unit sphere
+MOST = 100_000  # pixels that are examined
 
 
 def check_intrinsics(camera: Camera) -> None:
     """Raises `ValueError` where they are no pinhole camera's of this image; warns where they may be another image's."""
-    size, across = camera.intrinsics.new_tensor([camera.width, camera.height]), camera.intrinsics
-    (fx, fy), middle = across.diagonal()[:2].tolist(), across[:2, 2] / size
+    size = camera.intrinsics.new_tensor([camera.width, camera.height])
+    across = camera.intrinsics
+    (fx, fy) = across.diagonal()[:2].tolist()
+    middle = across[:2, 2] / size
     image = f"an image of {camera.height} × {camera.width} pixels"
     angle = torch.rad2deg(2 * torch.atan(camera.width / (2 * across[0, 0]))).item()
     if angle > WIDEST:
@@ -40,11 +42,13 @@ def check_intrinsics(camera: Camera) -> None:
 
 
 def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height width"]) -> None:
-    """Raises `ValueError` where depth is known of next to nothing but background."""
+    """Raises `ValueError` where almost all depths are of the background."""
     if not seen.any():
         return
-    within, beyond = (seen & mask).sum().item(), (seen & ~mask).sum().item()
-    inside, outside = mask.sum().item(), (~mask).sum().item()
+    within = (seen & mask).sum().item()
+    beyond = (seen & ~mask).sum().item()
+    inside = mask.sum().item()
+    outside = (~mask).sum().item()
     if not inside:
         raise ValueError(f"mask marks no pixel as object, but {beyond} have a depth; mark the object, or leave it out")
     if within / inside < RATHER * beyond / max(outside, 1):
@@ -69,7 +73,8 @@ def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> No
 def check_place(camera: Camera, depth: Float[Tensor, "height width"], observed: Bool[Tensor, "height width"]) -> None:
     """Raises `ValueError` where what was observed is not in the unit sphere, or the camera does not see that."""
     chosen = thinned(depth.isfinite() if depth.isfinite().any() else observed, MOST)
-    pixels, depth = camera.pixels()[chosen], depth[chosen]
+    pixels = camera.pixels()[chosen]
+    depth = depth[chosen]
     away = _away(camera, pixels, depth)
     if away <= ALMOST:
         return
@@ -82,7 +87,7 @@ def check_place(camera: Camera, depth: Float[Tensor, "height width"], observed: 
 
 
 def _away(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> float:
-    """From the origin, in the median: the points, or where there is no depth the rays."""
+    """Median distance from the origin of the points, or of the rays where there is no depth."""
     rays = camera.rays(pixels)
     nearest = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
     distance = torch.where(depth.isfinite(), depth / camera.cosines(pixels), nearest)
@@ -90,7 +95,7 @@ def _away(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
 
 
 def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> str:
-    """What would explain it best, if that explains it."""
+    """The most plausible mistake, if one explains the observation."""
     away, hint = min((_away(other, pixels, depth), hint) for hint, other in _others(camera).items())
     if away <= ALMOST:
         return hint
@@ -103,9 +108,11 @@ def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
 
 
 def _others(camera: Camera) -> dict[str, Camera]:
-    """What is often given in place of the camera that is meant."""
-    pose, centred = camera.T_world_camera, camera.intrinsics.clone()
-    inverse, upward = torch.linalg.inv(pose), torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    """Cameras after the usual mistakes are undone, by what to say of each mistake."""
+    pose = camera.T_world_camera
+    centred = camera.intrinsics.clone()
+    inverse = torch.linalg.inv(pose)
+    upward = torch.diag(pose.new_tensor([1, -1, -1, 1]))
     centred[:2, 2] = centred.new_tensor([camera.width, camera.height]) / 2
     means = "it maps camera axes (x right, y down, z forward) to the world"
     poses = {"the inverse, T_camera_world": inverse, "in OpenGL's axes": pose @ upward}

@@ -54,7 +54,8 @@ def unpacked(
     """
     if not deb.is_file():
         raise ValueError(f"there is no file {deb}; {by_hand(package)}")
-    home, source = folder / package, f"{deb.name} {deb.stat().st_size} {keeping}".rstrip() + "\n"
+    home = folder / package
+    source = f"{deb.name} {deb.stat().st_size} {keeping}".rstrip() + "\n"
     stamp = home / _STAMP
     if stamp.is_file() and stamp.read_text() == source:
         return home

@@ -113,7 +113,8 @@ def save_view(path: Path, view: View) -> None:
 def observe(solid: Solid, camera: Camera) -> View:
     """What the camera sees of a mesh's outer surface, by Embree's ray casting: nothing of ours but the camera."""
     rays = camera.rays()
-    origins, directions = rays.origins.reshape(-1, 3).numpy(), rays.directions.reshape(-1, 3).numpy()
+    origins = rays.origins.reshape(-1, 3).numpy()
+    directions = rays.directions.reshape(-1, 3).numpy()
     cast: Any = solid.surface.ray.intersects_id
     faces, pixels, points = cast(origins, directions, multiple_hits=False, return_locations=True)
     _, depths = camera.project(torch.from_numpy(points).float())

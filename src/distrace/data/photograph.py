@@ -1,4 +1,4 @@
-"""One photograph: what a camera saw, and where the object is in it."""
+"""One photograph: its camera, its colours, and the object's mask."""
 
 import math
 from dataclasses import dataclass
@@ -61,7 +61,8 @@ def _averaged(image: Float[Tensor, "rows columns channels"], factor: float) -> F
     """Along the rows, by differences of the integral: exact for any factor."""
     length = image.shape[0]
     edges = torch.arange(math.ceil(length * factor) + 1, dtype=torch.float64, device=image.device) / factor
-    start, end = edges[:-1].clamp_max(length - SLIVER), edges[1:].clamp_max(length)
+    start = edges[:-1].clamp_max(length - SLIVER)
+    end = edges[1:].clamp_max(length)
     integral = torch.cat([torch.zeros_like(image[:1]), image.cumsum(0)])
     return (_between(integral, end) - _between(integral, start)) / (end - start)[:, None, None]
 

@@ -1,4 +1,4 @@
-"""Where the unit sphere lies in the world of a folder of photographs, told or estimated."""
+"""Where the unit sphere lies in the world of a folder of photographs, as given or estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,10 +10,10 @@ from torch import Tensor
 
 from distrace.camera import Camera
 
-FEWEST = 20  # points that tell where an object is
-SHARE = 0.9  # of the points that lie within; the others are background and outliers
+FEWEST = 20  # points that locate an object
+SHARE = 0.9  # of the points are within the sphere; the others are background and outliers
 MARGIN = 1.1
-MOST = 1e30  # of a number that tells where something is
+MOST = 1e30  # largest coordinate
 PARALLEL = 1e-4  # of what the information on the worst known direction would be from all sides
 TELL = "tell where the object is as unit_sphere in views.json"
 
@@ -63,9 +63,9 @@ def among_points(points: Float[np.ndarray, "points 3"]) -> Placement | None:
     """The sphere around the median of points that holds nine in ten of them, and a margin; None for too few."""
     if len(points) < FEWEST:
         return None
-    there = torch.from_numpy(points).double()
-    centre = there.median(0).values
-    radius = (there - centre).norm(dim=-1).quantile(SHARE).item() * MARGIN
+    positions = torch.from_numpy(points).double()
+    centre = positions.median(0).values
+    radius = (positions - centre).norm(dim=-1).quantile(SHARE).item() * MARGIN
     return Placement(centre, radius) if radius > 0 else None
 
 

@@ -12,7 +12,8 @@ from distrace.data.debian import by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
-LICENCE, CREATOR = "GPL-2.0-or-later", "FlightGear team"
+LICENCE = "GPL-2.0-or-later"
+CREATOR = "FlightGear team"
 PARTS = {"light", "lights", "Lights", "refueling"}  # folders
 NO_PLANES = {"Ferry", "SpaceShuttle", "balloon"}
 

@@ -23,7 +23,7 @@ BEHIND = 0.02  # what is seen of the solid, if so far behind what is seen of the
 
 @dataclass(frozen=True)
 class Doubt:
-    """How far a shape's signs can be trusted."""
+    """A report on a shape: whether its signs are reliable, and if not, why."""
 
     name: str
     faces: int
@@ -51,11 +51,13 @@ def sample(solid: Solid, count: int, seed: int, near: float = NEAR) -> Float[np.
 
 
 def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
-    """A report on a shape's signs, at points in and around it."""
+    """How reliable a shape's signs are, by winding numbers at random points in and around it."""
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * np.abs(solid.soup.bounds).max(0) * 1.05
     winding = solid.winding(points)
     doubtful = float((np.abs(winding - np.round(winding)) > DOUBTFUL).mean())
-    outer, missing, sheet = float(solid.surface.area / solid.soup.area), lost(solid), thin(solid)
+    outer = float(solid.surface.area / solid.soup.area)
+    missing = lost(solid)
+    sheet = thin(solid)
     reasons = [f"{doubtful:.1%} of its signs are doubtful"] if doubtful > HOPELESS else []
     reasons += [f"{missing:.0%} of what is seen of it bounds no solid"] if missing > HOLLOW else []
     reasons += [f"{sheet:.0%} of its surface bounds nothing thicker than {THIN:g}"] if sheet > SHEET else []
@@ -63,7 +65,7 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
 
 
 def lost(solid: Solid, count: int = 5000) -> float:
-    """Of random rays that meet the mesh, the share that do not meet the solid there: a chair's seat of cane, say."""
+    """The share of random rays that hit the mesh but miss the solid there: a seat of cane without thickness, say."""
     random = np.random.default_rng(0)
     directions = random.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -74,7 +76,7 @@ def lost(solid: Solid, count: int = 5000) -> float:
 
 
 def thin(solid: Solid, count: int = 5000) -> float:
-    """Of the surface, the share behind which the solid ends before THIN: a sheet with a face on either side."""
+    """The share of the surface behind which the solid is thinner than THIN: a sheet with a face on either side."""
     points, faces = trimesh.sample.sample_surface(solid.surface, count, seed=0)[:2]
     inwards = -solid.surface.face_normals[faces]
     return float((first_met(solid.surface, points + 1e-5 * inwards, inwards) < THIN).mean())

@@ -1,4 +1,4 @@
-"""Sampling a folder of meshes: in parallel, going on where it was stopped."""
+"""Samples a folder of meshes in parallel; a run that was stopped resumes."""
 
 import json
 import zlib

@@ -20,12 +20,12 @@ from distrace.data.shapes import Shape
 from distrace.errors import explained
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
-OFFSET = 3e-4  # how far from a face its two sides are looked at
-SPACING = 0.02  # between the looks at one face
+OFFSET = 3e-4  # distance from a face at which its two sides are tested
+SPACING = 0.02  # between the test points of one face
 LEAST_VOLUME = 1e-9  # of a closed part that has an inside
 OPEN = 0.15  # of a part's area: larger holes make it a sheet
 ASCII = bytes(range(128)) + b"?" * 128  # what each byte becomes
-SMALLEST = 0.01  # faces half inside are split until their edges are this short
+SMALLEST = 0.01  # faces partly inside are split until their edges are this short
 
 
 @dataclass(frozen=True)
@@ -177,7 +177,7 @@ def _parts(soup: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def first_met(
     mesh: trimesh.Trimesh, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
-    """How far along each ray the mesh is met, by Embree; `inf` where it is not."""
+    """Distance along each ray to the mesh, by Embree; `inf` where a ray misses it."""
     cast: Any = mesh.ray.intersects_location
     points, rays, _ = cast(origins, directions, multiple_hits=False)
     distance = np.full(len(origins), np.inf)
@@ -187,7 +187,8 @@ def first_met(
 
 def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
     """The faces that have the solid on exactly one side, turned outwards; faces half buried are split first."""
-    kept, triangles = [], soup.triangles.view(np.ndarray)
+    kept = []
+    triangles = soup.triangles.view(np.ndarray)
     while len(triangles):
         share, outward = _exposure(soup, triangles)
         small = np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max(1) < SMALLEST
@@ -199,43 +200,50 @@ def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
 
 
 def bounding(soup: trimesh.Trimesh) -> Bool[np.ndarray, "faces"]:
-    """Which faces have the solid on exactly one side, at least in parts: none that is buried, and no loose sheet."""
+    """Which faces have the solid on exactly one side, at least in part: neither buried faces nor loose sheets."""
     return _exposure(soup, soup.triangles.view(np.ndarray))[0] > 0
 
 
 def _exposure(soup: trimesh.Trimesh, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of each triangle, the share of looks that see the solid on one side only, and whether its normal points out."""
+    """Of each triangle, the share of test points with the solid on one side only, and whether its normal points out."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1)
-    looks = np.clip(np.ceil(doubled_area / 2 / SPACING**2), 3, 500).astype(int)
-    face = np.repeat(np.arange(len(triangles)), looks)
-    points = np.einsum("nk,nkd->nd", _spread(looks), triangles[face])
+    tests = np.clip(np.ceil(doubled_area / 2 / SPACING**2), 3, 500).astype(int)
+    face = np.repeat(np.arange(len(triangles)), tests)
+    points = np.einsum("nk,nkd->nd", _spread(tests), triangles[face])
     normals = (cross / doubled_area[:, None])[face]
     front = _inside(_winding(soup, points + OFFSET * normals))
     back = _inside(_winding(soup, points - OFFSET * normals))
-    share = np.bincount(face, front != back, len(triangles)) / looks
+    share = np.bincount(face, front != back, len(triangles)) / tests
     outward = np.bincount(face, back.astype(int) - front.astype(int), len(triangles)) >= 0
     return share, outward
 
 
-def _spread(looks: np.ndarray) -> Float[np.ndarray, "n 3"]:
+def _spread(tests: np.ndarray) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of evenly spread points: the R2 sequence (Roberts 2018), folded into each triangle."""
-    index = np.concatenate([np.arange(n) for n in looks])
-    u, v = (index * 0.7548776662) % 1 * 0.98 + 0.01, (index * 0.5698402910 + 0.3) % 1 * 0.98 + 0.01
+    index = np.concatenate([np.arange(n) for n in tests])
+    u = (index * 0.7548776662) % 1 * 0.98 + 0.01
+    v = (index * 0.5698402910 + 0.3) % 1 * 0.98 + 0.01
     fold = u + v > 1
-    u, v = np.where(fold, 1 - u, u), np.where(fold, 1 - v, v)
+    u = np.where(fold, 1 - u, u)
+    v = np.where(fold, 1 - v, v)
     return np.stack([1 - u - v, u, v], axis=1)
 
 
 def _quartered(triangles: np.ndarray) -> np.ndarray:
-    a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
-    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    a = triangles[:, 0]
+    b = triangles[:, 1]
+    c = triangles[:, 2]
+    ab = (a + b) / 2
+    bc = (b + c) / 2
+    ca = (c + a) / 2
     parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
 def _winding(soup: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
-    vertices, faces = np.asarray(soup.vertices, np.float64), np.asarray(soup.faces, np.int64)
+    vertices = np.asarray(soup.vertices, np.float64)
+    faces = np.asarray(soup.faces, np.int64)
     return np.asarray(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points, np.float64)))
 
 

@@ -59,7 +59,8 @@ def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor
     steps = (torch.arange(CELLS, dtype=torch.float64) + 0.5) * 2 / CELLS - 1
     places = sphere.to_world(torch.cartesian_prod(steps, steps, steps))
     reach = math.sqrt(3) * sphere.radius / CELLS
-    seen, allowed = torch.zeros(len(places)), torch.zeros(len(places))
+    seen = torch.zeros(len(places))
+    allowed = torch.zeros(len(places))
     for camera, mask in zip(cameras, masks):
         inside, hit = _near(camera, mask, places, reach, sphere.centre)
         seen += inside

@@ -19,7 +19,7 @@ from distrace.reconstruction.colour_refinement import Canvas
 from distrace.reconstruction.matching import Matching
 from distrace.reconstruction.surface_network import ColourNetwork, CountedSurface, SurfaceNetwork, SurfaceSpecs
 from distrace.reconstruction.terms import Pool, terms_of
-from distrace.training.loss_history import record
+from distrace.training.losses import record
 
 STEEPEST = 1.0  # norm of the gradient by the surface's weights: a few rays that graze must not throw it off
 

@@ -23,7 +23,7 @@ from distrace.report.charts import curves
 from distrace.report.page import Html, figure, page, paragraph, section, table
 from distrace.report.scene import scene
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
-from distrace.training.loss_history import COURSE
+from distrace.training.losses import COURSE
 
 AT_ONCE = 1 << 16  # points whose colours are asked for
 FINER = 2  # rays across a pixel: photographs have means over areas

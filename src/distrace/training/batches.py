@@ -1,4 +1,4 @@
-"""The samples that a training learns from, and what is drawn of them for each step."""
+"""Signed samples of the training shapes, and the random batches of each step."""
 
 import os
 import warnings
@@ -24,7 +24,7 @@ Batch = tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]
 
 @dataclass(frozen=True)
 class Side:
-    """The samples of all shapes on one side of their surfaces, one shape's after another's: drawn in one go."""
+    """The samples of all shapes on one side of their surfaces, concatenated so that one gather draws a batch."""
 
     samples: Float[Tensor, "n 4"]
     begins: Int[Tensor, "shapes"]
@@ -35,15 +35,15 @@ class Side:
         counts = torch.tensor([len(part) for part in parts])
         return Side(torch.cat(parts), counts.cumsum(0) - counts, counts)
 
-    def drawn(self, shapes: Int[Tensor, "some"], number: int) -> Float[Tensor, "some number 4"]:
-        """As many of each of the shapes, at random."""
+    def drawn(self, shapes: Int[Tensor, "chosen"], number: int) -> Float[Tensor, "chosen number 4"]:
+        """`number` random samples of each of the shapes."""
         places = (torch.rand(len(shapes), number, dtype=torch.float64) * self.counts[shapes, None]).long()
         return self.samples[(self.begins[shapes, None] + places).to(self.samples.device)]
 
 
 @dataclass(frozen=True)
 class Samples:
-    """Signed samples of the shapes to learn."""
+    """Signed samples of the training shapes: one tensor a shape, of points and distances."""
 
     names: list[str]
     outside: list[Float[Tensor, "_ 4"]]
@@ -58,10 +58,10 @@ class Samples:
         return torch.tensor([VARIANT in name for name in self.names])
 
     def drawn(self, shapes: int, samples: int, variants: float) -> Batch:
-        """So many shapes, of which variants are drawn less often, and of all together so many samples."""
-        some = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
-        per_side = max(samples // len(some) // 2, 1)
-        return some, torch.cat([side.drawn(some, per_side) for side in self.sides], dim=1)
+        """A batch of `samples` from `shapes` random shapes; variants are drawn with the weight `variants`."""
+        chosen = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
+        per_side = max(samples // len(chosen) // 2, 1)
+        return chosen, torch.cat([side.drawn(chosen, per_side) for side in self.sides], dim=1)
 
     def to(self, device: torch.device) -> "Samples":
         return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])

@@ -1,4 +1,4 @@
-"""A training run on disk: everything needed to go on as if it had not been stopped, in one file."""
+"""The checkpoint of a training run: one file, from which a resumed run ends like an uninterrupted one."""
 
 import math
 import operator
@@ -11,14 +11,14 @@ from distrace.errors import explained
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import written
 from distrace.training.config import TrainConfig
-from distrace.training.loss_history import COURSE
+from distrace.training.losses import COURSE
 from distrace.training.trainer import Training, start
 
 NAME = "checkpoint.pt"
 
 
 def save_training(folder: Path, training: Training, config: TrainConfig, names: list[str]) -> None:
-    """Replaces the run's checkpoint; at no moment is there none."""
+    """Replaces the run's checkpoint in one step."""
     state = {
         "step": training.step,
         "losses": training.losses,

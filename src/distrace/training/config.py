@@ -1,4 +1,4 @@
-"""What a training run is told."""
+"""The configuration of a training run."""
 
 import math
 from dataclasses import dataclass
@@ -14,18 +14,16 @@ class TrainConfig:
     learning_rate: float = 1e-3
     code_learning_rate: float = 2e-3
     warm_up: int = 500  # steps
-    cool_down: float = (
-        0.4  # share of the steps; until it begins, a run can be given more steps as if it had them always
-    )
-    clamp: float = 0.1  # distances beyond are learnt as "far"
-    wrong_sign: float = 1.0  # × as much counts a sample on whose side of the surface the field is not
-    large: float = math.inf  # errors above count by their squares: what fills gaps is far off, and rare
-    dwell: int = 1  # times a sample is drawn where the network it began with has signs wrong, to once elsewhere
-    keep: float = 0.0  # × as much as samples counts that the field between codes stays what it was
+    cool_down: float = 0.4  # share of the steps; a run can be prolonged until it begins
+    clamp: float = 0.1  # distances are clamped to ± this
+    wrong_sign: float = 1.0  # weight of samples whose predicted sign is wrong; raise it when thin parts vanish
+    large: float = math.inf  # errors above it count by their squares; 0.02 keeps gaps open
+    dwell: int = 1  # oversampling where the initial network has signs wrong
+    keep: float = 0.0  # weight of the distillation loss at codes between training shapes
     code_penalty: float = 1e-4
     code_bound: float = 1.0
-    code_deviation: float = 0.05  # of a code's entries at the start
-    variant_weight: float = 0.5  # how often a variant, whose name has a ~, is drawn, to once an original
+    code_deviation: float = 0.05  # standard deviation of the initial codes' entries
+    variant_weight: float = 0.5  # how often a variant (~ in its name) is drawn, relative to an original
     bfloat16: bool = False
     seed: int = 0
 

@@ -1,4 +1,4 @@
-"""Where a model that is learnt further is wrong: from there samples are drawn more often."""
+"""Oversampling of places where the model to fine-tune has wrong signs."""
 
 import numpy as np
 import torch
@@ -9,15 +9,15 @@ from torch import Tensor
 from distrace.checkpoints.model import VARIANT, Model
 from distrace.training.batches import Samples
 
-REACH = 0.02  # a sample so near to one whose sign is wrong counts as well, on whichever side of the surface
-CERTAIN = 0.002  # the sign of a sample nearer to the surface says little
+REACH = 0.02  # samples this near to one whose sign is wrong are oversampled too, on both sides of the surface
+CERTAIN = 0.002  # signs of samples nearer to the surface are ignored
 
 
 def dwelling(samples: Samples, model: Model, times: int) -> Samples:
-    """The samples, with those of shapes that the model knows `times` over where it is wrong; variants stay as they are.
+    """The samples, repeated `times` over where the model's signs are wrong; variants and new shapes stay as they are.
 
-    The places are told once, and both of their sides are drawn alike: what counts more as long as its sign is wrong
-    has its least loss at zero wherever signs are hard to tell, and flattens the field there.
+    Places are chosen once, on both sides of the surface: a weight that a sample has only while its sign is wrong would
+    pull the field to zero wherever signs are hard to learn.
     """
     parts = []
     for name, outside, inside in zip(samples.names, samples.outside, samples.inside, strict=True):
@@ -25,7 +25,7 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
             wrong = _wrong_places(model, name, torch.cat([outside, inside]))
             chosen = wrong[: len(outside)], wrong[len(outside) :]
             outside, inside = (
-                torch.cat([side, side[there].repeat(times - 1, 1)]) for side, there in zip((outside, inside), chosen)
+                torch.cat([side, side[near].repeat(times - 1, 1)]) for side, near in zip((outside, inside), chosen)
             )
         parts.append((outside, inside))
     return Samples(samples.names, [outside for outside, _ in parts], [inside for _, inside in parts])
@@ -33,8 +33,9 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
 
 @torch.no_grad()
 def _wrong_places(model: Model, name: str, samples: Float[Tensor, "n 4"]) -> Bool[Tensor, "n"]:
-    """Which samples lie within REACH of one whose sign the model has wrong for certain."""
-    values, distances = model.field(model.code_of(name))(samples[:, :3]), samples[:, 3]
+    """Which samples lie within REACH of one whose sign the model has wrong."""
+    values = model.field(model.code_of(name))(samples[:, :3])
+    distances = samples[:, 3]
     wrong = (values * distances < 0) & (distances.abs() > CERTAIN)
     if not wrong.any():
         return wrong

@@ -16,13 +16,12 @@ from distrace.training.batches import Samples
 from distrace.training.config import TrainConfig
 from distrace.training.cuda_graph import Recorded
 from distrace.training.distillation import Kept
-from distrace.training.loss_history import record
-from distrace.training.losses import clamped_loss, training_loss
+from distrace.training.losses import clamped_loss, record, training_loss
 
 
 @dataclass
 class Training:
-    """What a run changes as it goes on, and what a checkpoint holds."""
+    """The state of a run: a checkpoint holds all of it."""
 
     decoder: Decoder
     codes: nn.Parameter  # [shapes, length]
@@ -56,7 +55,7 @@ def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.d
 
 @torch.no_grad()
 def begin_with(training: Training, names: list[str], model: Model) -> None:
-    """Takes over a model's network, and its codes of shapes of the same names; others begin as `codes_of` tells."""
+    """Copies a model's weights, and its codes of shapes of these names; other codes start as `Model.codes_of` says."""
     for layer in range(training.decoder.depth):
         own, learnt = (getattr(decoder, f"lin{layer}") for decoder in (training.decoder, model.decoder))
         if is_parametrized(own, "weight"):
@@ -70,10 +69,11 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
 def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept | None = None) -> Iterator[Step]:
     """Trains in place and yields after every step, from wherever `training` is to the last one.
 
-    What is `kept` counts `config.keep` times. The draw of a step depends on the seed and the step alone: a run that was
-    stopped goes on as if it had not been.
+    The distillation loss of `kept` has the weight `config.keep`. A step's random draw depends on the seed and the step
+    alone, so a run that was stopped and resumed ends with the same weights.
     """
-    device, step = training.codes.device, partial(_step, training, config, kept)
+    device = training.codes.device
+    step = partial(_step, training, config, kept)
     training.decoder.train()
     _prepare(training.optimiser, device)
     if device.type == "cuda":
@@ -97,14 +97,15 @@ def _step(
     batch: Float[Tensor, "shapes n 4"],
     between: Float[Tensor, "shapes length"] | None = None,
 ) -> Tensor:
-    """A step on the samples drawn, and at half of their points on the codes between; the loss of the samples."""
+    """One optimiser step; returns the samples' loss. Half of their points serve the distillation at codes `between`."""
     codes = training.codes.index_select(0, shapes)
     rest = config.code_penalty * codes.square().sum(-1).mean()
     with torch.autocast(batch.device.type, torch.bfloat16, enabled=config.bfloat16, cache_enabled=False):
         values = training.decoder(batch[..., :3], codes[:, None])
         if kept is not None and between is not None:
             points = batch[:, ::2, :3]
-            now, before = training.decoder(points, between[:, None]), kept.values(points, between)
+            now = training.decoder(points, between[:, None])
+            before = kept.values(points, between)
             rest = rest + config.keep * clamped_loss(now.float(), before.float(), config.clamp)
     loss = training_loss(values.float(), batch[..., 3], config)
     training.optimiser.zero_grad()
@@ -115,16 +116,17 @@ def _step(
 
 
 def _prepare(optimiser: torch.optim.Adam, device: torch.device) -> None:
-    """Makes the optimiser one whose steps can be recorded, on a GPU, or cannot, whatever it was before."""
+    """Sets Adam's `capturable` flag and tensor learning rates on a GPU, as CUDA graphs need; else resets them."""
     recorded = device.type == "cuda"
     for group in optimiser.param_groups:
-        group["capturable"], group["lr"] = recorded, torch.zeros((), device=device) if recorded else 0.0
+        group["capturable"] = recorded
+        group["lr"] = torch.zeros((), device=device) if recorded else 0.0
 
 
 def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
     for group, rate in zip(optimiser.param_groups, rates, strict=True):
         if isinstance(group["lr"], Tensor):
-            group["lr"].fill_(rate)  # a recorded step reads it where it lies
+            group["lr"].fill_(rate)  # a CUDA graph reads it from this address
         else:
             group["lr"] = rate
 
@@ -136,7 +138,7 @@ def bound_codes(codes: Tensor, bound: float) -> None:
 
 
 def _rate(step: int, config: TrainConfig) -> float:
-    """Of the highest one. A trapezium does what a cosine does, and can be prolonged (Hägele et al., NeurIPS 2024)."""
+    """The factor of the learning rate at a step: a trapezium, which can be prolonged (Hägele et al., NeurIPS 2024)."""
     left = (config.steps - step) / (config.steps * config.cool_down)
     return min(1.0, (step + 1) / config.warm_up, left)
 

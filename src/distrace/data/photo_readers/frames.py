@@ -1,4 +1,4 @@
-"""What a folder says of its photographs before their pixels are read, whatever its layout."""
+"""The cameras and files of a folder's photographs, in any layout, before their pixels are read."""
 
 import json
 import os
@@ -26,12 +26,12 @@ class Shot:
     intrinsics: Float[np.ndarray, "rows columns"]  # what these hold is checked with the image
     T_world_camera: Float[np.ndarray, "rows_ columns_"]
     mask: Path | None = None
-    size: tuple[int, int] | None = None  # height and width, where they are told
+    size: tuple[int, int] | None = None  # height and width, where the folder has them
 
 
 @dataclass(frozen=True)
 class Shots:
-    """All views; where the unit sphere is, if that is told; and points that are known of the scene, if any are."""
+    """All views, and where the folder has them the unit sphere's placement and points of the scene."""
 
     layout: str
     views: tuple[Shot, ...]

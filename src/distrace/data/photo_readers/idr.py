@@ -23,7 +23,8 @@ def read(folder: Path) -> Shots | None:
     path = folder / NAME
     if not path.is_file():
         return None
-    images, masks = images_in(folder / "image"), images_in(folder / "mask")
+    images = images_in(folder / "image")
+    masks = images_in(folder / "mask")
     matrices = _matrices(path)
     _check_counts(path, matrices, images, masks)
     if not images:
@@ -67,7 +68,8 @@ def decomposed(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         raise ValueError("its left three columns have no inverse; it maps points of the world to pixels")
     upper, rotation = rq(left)
     signs = np.sign(np.diag(upper))  # the decomposition is unique with a positive diagonal
-    upper, rotation = upper * signs, rotation * signs[:, None]
+    upper = upper * signs
+    rotation = rotation * signs[:, None]
     pose = np.eye(4)
     pose[:3, :3] = rotation.T
     pose[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
@@ -78,8 +80,10 @@ def _placement(path: Path, matrices: dict[str, np.ndarray], count: int) -> Place
     with about(path):
         scales = [matrix(matrices, f"scale_mat_{k}", 4, 4) for k in range(count)]
         first = scales[0]
-        radius, plain = float(first[0, 0]), first.copy()
-        plain[:3, :3], plain[3] = radius * np.eye(3), (0, 0, 0, 1)
+        radius = float(first[0, 0])
+        plain = first.copy()
+        plain[:3, :3] = radius * np.eye(3)
+        plain[3] = (0, 0, 0, 1)
         if not radius > 0 or np.abs(plain - first).max() > TOLERANCE * radius:
             raise ValueError("scale_mat_0 is no scale and shift; it maps the unit sphere to the world")
         for k, scale in enumerate(scales):

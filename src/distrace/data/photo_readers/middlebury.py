@@ -34,8 +34,10 @@ def _shot(folder: Path, words: list[str], field: str) -> Shot:
         with explained(f"{words[0]} is followed by {len(words) - 1} words; {NUMBERS} numbers are needed: K, R, t"):
             numbers = np.array(words[1:], np.float64)
             intrinsics, rotation, shift = np.split(numbers.reshape(NUMBERS), (9, 18))
-        intrinsics, rotation = intrinsics.reshape(3, 3), rotation.reshape(3, 3)
+        intrinsics = intrinsics.reshape(3, 3)
+        rotation = rotation.reshape(3, 3)
         intrinsics[:2, 2] += CENTRE
         pose = np.eye(4)
-        pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ shift
+        pose[:3, :3] = rotation.T
+        pose[:3, 3] = -rotation.T @ shift
         return Shot(field, image, intrinsics, pose)

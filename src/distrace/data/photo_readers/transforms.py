@@ -58,7 +58,8 @@ def _check_distortion(entry: dict[str, Any]) -> None:
 
 
 def _intrinsics(entry: dict[str, Any], height: int, width: int) -> np.ndarray:
-    focal_x, focal_y = _focal(entry, "x", width), _focal(entry, "y", height)
+    focal_x = _focal(entry, "x", width)
+    focal_y = _focal(entry, "y", height)
     if focal_x is None and focal_y is None:
         raise ValueError("there is neither fl_x nor camera_angle_x; one tells the focal length")
     across = _number(entry, "cx") if "cx" in entry else width / 2
