@@ -165,13 +165,16 @@ def _parts(soup: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     merged = soup.copy()
     merged.merge_vertices()
     part = trimesh.graph.connected_component_labels(merged.face_adjacency, node_count=len(merged.faces))
-    vectors = soup.area_faces[:, None] * soup.face_normals
-    total = np.stack([np.bincount(part, column) for column in vectors.T], axis=1)
     area = np.bincount(part, soup.area_faces)
-    centre = np.stack([np.bincount(part, column) for column in (soup.triangles_center * soup.area_faces[:, None]).T], 1)
-    towards = soup.triangles_center - (centre / area[:, None])[part]
-    volume = np.bincount(part, (towards * vectors).sum(1) / 3)
-    return part, volume, np.linalg.norm(total, axis=1) < OPEN * area
+
+    def integral(values: np.ndarray) -> np.ndarray:
+        weighted = values * soup.area_faces[:, None]
+        return np.stack([np.bincount(part, column) for column in weighted.T], axis=1)
+
+    centre = integral(soup.triangles_center) / area[:, None]
+    heights = ((soup.triangles_center - centre[part]) * soup.face_normals).sum(1)
+    volume = np.bincount(part, heights * soup.area_faces / 3)
+    return part, volume, np.linalg.norm(integral(soup.face_normals), axis=1) < OPEN * area
 
 
 def first_met(
