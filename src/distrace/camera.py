@@ -13,7 +13,7 @@ from distrace.rays import Rays
 from distrace.viewpoint import Number, Point, orbiting, together, upright
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Camera(ByValue):
     """Intrinsics in pixels and the pose that maps camera to world; both may have batch axes and may require grad."""
 

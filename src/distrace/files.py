@@ -13,8 +13,9 @@ from torch import Tensor
 
 
 @contextmanager
-def written(path: Path) -> Iterator[BinaryIO]:
+def written(path: str | Path) -> Iterator[BinaryIO]:
     """A file to write; it takes the name `path` only once all of it is on the disk."""
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -28,27 +29,27 @@ def written(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
+def alone(folder: str | Path) -> Iterator[None]:
     """Keeps a folder to one process, for as long as it runs. Raises `ValueError` where another has it."""
     try:
-        held = FileLock(folder / ".lock").acquire(blocking=False)
+        held = FileLock(Path(folder) / ".lock").acquire(blocking=False)
     except Timeout:
         raise ValueError(f"another run is writing {folder}; wait for its end, or give another --out") from None
     with held:
         yield
 
 
-def save_text(path: Path, text: str) -> None:
+def save_text(path: str | Path, text: str) -> None:
     with written(path) as file:
         file.write(text.encode())
 
 
-def save_json(path: Path, content: Any) -> None:
+def save_json(path: str | Path, content: Any) -> None:
     with written(path) as file:
         file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
 
 
-def save_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
+def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
     """An `.npz` of tensors."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
     with written(path) as file:

@@ -3,17 +3,19 @@
 import math
 import warnings
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Float, Int
-from skimage.measure import marching_cubes
 from torch import Tensor
 
 from distrace.errors import DoubtfulResult
-from distrace.fields.base import SDF, asked, chunked, narrowed
+from distrace.fields.base import SDF, asked, check_field, chunked, narrowed
 from distrace.fields.lipschitz import steep, typical_slope
+
+if TYPE_CHECKING:
+    import trimesh
 
 AT_ONCE = 1 << 16  # points, of a field that does not limit them itself
 MOST = 2048  # cells along an axis: 32 GiB of values
@@ -45,12 +47,16 @@ class MeshConfig:
 
 
 @torch.no_grad()
-def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> trimesh.Trimesh:
+def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> "trimesh.Trimesh":
     """Marching cubes (Lorensen and Cline, SIGGRAPH 1987) on the cells of a grid that can hold the surface.
 
     Normals point out. Raises `ValueError` where the field has no zero in the cube. Warns by `DoubtfulResult` of a field
     that is NaN at points in the ball, whose mesh may be open, and of one that is negative all around the ball.
     """
+    import trimesh
+    from skimage.measure import marching_cubes
+
+    check_field(sdf)
     sdf = watched = _Watched(sdf if hasattr(sdf, "narrowed") else chunked(sdf, AT_ONCE), config.radius)
     around = asked(sdf, _around(config))
     slope, _ = typical_slope(sdf, torch.empty(0, device=config.device), config.radius)

@@ -1,15 +1,17 @@
 """Comparing surfaces, masks and depths."""
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
-POINTS = 30_000
+if TYPE_CHECKING:
+    import trimesh
+
+POINTS = 30_000  # on each mesh
 
 
 @dataclass(frozen=True)
@@ -24,24 +26,31 @@ class Chamfer:
         return self.to + self.from_
 
 
-def chamfer(predicted: trimesh.Trimesh | np.ndarray, truth: trimesh.Trimesh | np.ndarray, seed: int = 0) -> Chamfer:
+def chamfer(predicted: "trimesh.Trimesh | np.ndarray", truth: "trimesh.Trimesh | np.ndarray", seed: int = 0) -> Chamfer:
     """Chamfer distance of two meshes (30,000 points on each) or clouds [n, 3]: squared, × 1000, each direction its own.
 
     Raises `ValueError` for an empty surface.
     """
-    first, second = _cloud(predicted, seed), _cloud(truth, seed + 1)
+    from scipy.spatial import KDTree
+
+    first = _cloud(predicted, seed)
+    second = _cloud(truth, seed + 1)
     to, _ = KDTree(second).query(first, workers=-1)
     from_, _ = KDTree(first).query(second, workers=-1)
     return Chamfer(float(1000 * np.mean(to**2)), float(1000 * np.mean(from_**2)))
 
 
-def surface_points(mesh: trimesh.Trimesh, count: int, seed: int) -> Float[np.ndarray, "count 3"]:
+def surface_points(mesh: "trimesh.Trimesh", count: int, seed: int) -> Float[np.ndarray, "count 3"]:
     """Points spread evenly over a mesh."""
-    return np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+    from trimesh.sample import sample_surface
+
+    return np.asarray(sample_surface(mesh, count, seed=seed)[0])
 
 
-def _cloud(surface: trimesh.Trimesh | np.ndarray, seed: int) -> Float[np.ndarray, "n 3"]:
+def _cloud(surface: "trimesh.Trimesh | np.ndarray", seed: int) -> Float[np.ndarray, "n 3"]:
     """Points of a mesh; a cloud is taken as it is."""
+    import trimesh
+
     if isinstance(surface, trimesh.Trimesh):
         if not len(surface.faces):
             raise ValueError("a mesh without faces was given; chamfer needs a surface on both sides")

@@ -7,9 +7,31 @@ import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from distrace.camera import Camera
+from distrace.equality import ByValue
 from distrace.rays import Rays
+
+
+def exp_se3(
+    rotation_vector: Float[Tensor, "*batch 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Returns the exponential of a twist: the rigid motion that it leads to in unit time, as a matrix.
+
+    `rotation_vector` is the axis times the angle in radians; `translation` is the velocity of the origin, so the origin
+    moves by V · translation (Murray, Li and Sastry, *A Mathematical Introduction to Robotic Manipulation*, 2.3.2). Both
+    keep their gradients, also at zero: optimise them, and move a camera by `exp_se3(r, t) @ camera.T_world_camera`.
+
+    >>> turn = torch.tensor([0.0, torch.pi / 2, 0.0])
+    >>> (exp_se3(turn, torch.zeros(3))[:3, :3] @ torch.tensor([0.0, 0.0, 1.0])).round().tolist()
+    [1.0, 0.0, 0.0]
+    """
+    x, y, z = rotation_vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rotation = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*x.shape, 3, 3)
+    generator = torch.cat([rotation, translation[..., None]], dim=-1)
+    return torch.linalg.matrix_exp(pad(generator, (0, 0, 0, 1)))
 
 
 def object_in_camera(camera: Camera) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
@@ -61,8 +83,8 @@ def pose_error(camera: Camera, truth: Camera) -> tuple[float, float]:
     return degrees, 100 * float((translation - there).norm() / there.norm())
 
 
-@dataclass(frozen=True)
-class Similarity:
+@dataclass(frozen=True, eq=False, repr=False)
+class Similarity(ByValue):
     """Where an object lies in the world: x_world = scale · rotation · x_object + translation."""
 
     rotation: Float[Tensor, "3 3"]

@@ -8,12 +8,14 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.equality import ByValue
+
 LEAST_DEVIATION = 0.4  # of the mean one: on held-out sofas better than none and no worse than 1
 DEVIATION = 0.7  # of the prior's, in draws of starts
 
 
-@dataclass(frozen=True)
-class Prior:
+@dataclass(frozen=True, eq=False, repr=False)
+class Prior(ByValue):
     """Codes as mean + basis · w, with w of unit variance over the training codes: steps follow what shapes do."""
 
     mean: Float[Tensor, "length"]

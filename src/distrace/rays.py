@@ -9,7 +9,7 @@ from torch import Tensor
 from distrace.equality import ByValue
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rays(ByValue):
     """Half lines origin + t · direction; directions have unit length, so t is a distance."""
 
@@ -33,7 +33,7 @@ class Rays(ByValue):
         return Rays(self.origins.detach(), self.directions.detach())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Bounds(ByValue):
     """The stretch of each ray that is looked at; empty (near > far) where the ray misses what bounds the field."""
 

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import wraps
-from typing import Any
+from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,8 +14,9 @@ from torch.nn.functional import max_pool2d
 
 from distrace import surface
 from distrace.camera import Camera
+from distrace.equality import ByValue, summary
 from distrace.errors import DoubtfulResult
-from distrace.fields.base import SDF
+from distrace.fields.base import SDF, check_field
 from distrace.fields.batch import BatchField
 from distrace.rays import Rays, meet_sphere
 from distrace.tracing import coarse_to_fine as pyramid
@@ -31,11 +32,17 @@ DOUBTFUL = 1e-3  # of the rays: more without an answer are worth a warning
 
 Config = TraceConfig | TracerConfig
 Image = Callable[["Buffers"], Tensor]
+"""Computes one image of a rendering."""
 STRATEGIES: dict[str, Config] = {**MARCHES, "fast": TracerConfig()}
 
 
 class _Shared(torch.autograd.Function):
     """The identity, for an image that others are made from; it explains why a second backward pass fails."""
+
+    @classmethod
+    def attached(cls, image: Tensor) -> Tensor:
+        """Returns the image with this function in its graph."""
+        return cast(Tensor, cls.apply(image))
 
     @staticmethod
     def forward(ctx: Any, shared: Tensor) -> Tensor:
@@ -54,23 +61,27 @@ class _Shared(torch.autograd.Function):
         return slope
 
 
-def _kept(image: Image) -> property:
-    """Makes an image when it is first asked for; once with its gradients, and once without where grad mode is off."""
+def _cached(compute: Image) -> Image:
+    """Computes an image on first use: once with its gradients, and once without where grad mode is off."""
 
-    @wraps(image)
+    @wraps(compute)
     def read(buffers: "Buffers") -> Tensor:
-        key = image.__name__, torch.is_grad_enabled()
+        key = (compute.__name__, torch.is_grad_enabled())
         if key not in buffers.images:
-            made = image(buffers)
-            buffers.images[key] = _Shared.apply(made) if made.requires_grad else made
+            image = compute(buffers)
+            buffers.images[key] = _Shared.attached(image) if image.requires_grad else image
         return buffers.images[key]
 
-    return property(read)
+    return read
 
 
-@dataclass(frozen=True)
-class Buffers:
-    """What a camera sees of a field. Images are made when first asked for, and differentiable in all that went in."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Buffers(ByValue):
+    """The images that a camera sees of a field, as `render` returns them.
+
+    Each image is computed on first use, and differentiable in the field and the camera. Images have the shape
+    `[*batch, height, width]` of the camera; lengths are in the units of the world.
+    """
 
     sdf: SDF | BatchField  # of one shape, or of the shape of each camera
     rays: Rays
@@ -79,7 +90,11 @@ class Buffers:
     radius: float
     occupancy: Occupancy | None = None  # the default tracer's, for other views of the same field
     pixel: Float[Tensor, "*batch"] | None = None  # the width that a pixel covers at a distance of 1
-    images: dict[tuple[str, bool], Tensor] = field(default_factory=dict, init=False, repr=False)  # made so far
+    images: dict[tuple[str, bool], Tensor] = field(default_factory=dict, init=False, compare=False)  # computed so far
+
+    def __repr__(self) -> str:
+        hits = f"{int(self.mask.sum()):,} of {self.mask.numel():,} rays hit"
+        return f"Buffers({summary(self.trace.distance)}, {hits}, radius={self.radius:g})"
 
     @property
     def mask(self) -> Bool[Tensor, "*batch"]:
@@ -91,7 +106,8 @@ class Buffers:
             return self.sdf
         return self.sdf.select(self._shapes(chosen))
 
-    @_kept
+    @property
+    @_cached
     def distance(self) -> Float[Tensor, "*batch"]:
         """Along the ray; `inf` where nothing was hit."""
         hit = self.trace.hit
@@ -100,26 +116,30 @@ class Buffers:
         attached = surface.attach(self.field_at(hit), self.rays[hit], self.trace.distance[hit])
         return self.trace.distance.masked_scatter(hit, attached)
 
-    @_kept
+    @property
+    @_cached
     def depth(self) -> Float[Tensor, "*batch"]:
         """Along the optical axis; `inf` where nothing was hit."""
         missed = ~self.trace.hit
         along = self.distance.masked_fill(missed, 0.0)  # inf times a zero gradient would be NaN
         return (along * self.cosines).masked_fill(missed, torch.inf)
 
-    @_kept
+    @property
+    @_cached
     def points(self) -> Float[Tensor, "hits 3"]:
         """Where the rays of the mask hit, in the world."""
         hit = self.trace.hit
         return self.rays[hit].at(self.distance[hit])
 
-    @_kept
+    @property
+    @_cached
     def normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
         normals = surface.normals(self.field_at(self.mask), self.points)
         return torch.zeros_like(self.rays.directions).masked_scatter(self.mask[..., None], normals)
 
-    @_kept
+    @property
+    @_cached
     def footprint_widths(self) -> Float[Tensor, "hits"]:
         """Of the balls that footprint normals are averaged over: FOOTPRINT pixels, at most WIDEST of the radius."""
         hit = self.trace.hit
@@ -127,7 +147,8 @@ class Buffers:
         widest = torch.full_like(distance, WIDEST * self.radius)
         return widest if self.pixel is None else widest.minimum(FOOTPRINT * distance * self.pixel.expand_as(hit)[hit])
 
-    @_kept
+    @property
+    @_cached
     def footprint_normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals averaged over a few pixels, in world axes, zero where nothing was hit.
 
@@ -137,7 +158,8 @@ class Buffers:
         normals = surface.footprint_normals(self.field_at(self.mask), self.points, self.footprint_widths)
         return torch.zeros_like(self.rays.directions).masked_scatter(self.mask[..., None], normals)
 
-    @_kept
+    @property
+    @_cached
     def clearance(self) -> Float[Tensor, "*batch"]:
         """The least sdf on each ray that misses, and sdf at hits; `inf` where a ray never meets the bounds.
 
@@ -201,6 +223,7 @@ def render(
     """
     if not 0 < radius < math.inf:
         raise ValueError(f"a radius of {radius} was given; the field lies in a sphere of positive, finite radius")
+    check_field(sdf)
     rays, cosines, angle = camera.sight()
     if isinstance(config, TracerConfig):
         trace, occupancy = trace_images(sdf, camera, rays, radius, config, occupancy)

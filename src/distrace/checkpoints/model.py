@@ -7,8 +7,10 @@ A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParam
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import safetensors.torch
@@ -17,18 +19,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
+from distrace.equality import ByValue, summary
 from distrace.errors import explained
-from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
-from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
 VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
 
 
-@dataclass(frozen=True)
-class Model:
+@dataclass(frozen=True, eq=False, repr=False)
+class Model(ByValue):
     """A trained decoder and the codes of the shapes it was trained on. Weights are frozen: `requires_grad_()` thaws."""
 
     name: str
@@ -36,7 +38,13 @@ class Model:
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
+    @overload
+    def field(self, code: int) -> ShapeField: ...
+
+    @overload
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]: ...
+
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
         """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
 
         Raises `ValueError` for a number or a length that the model has not.
@@ -47,8 +55,16 @@ class Model:
             raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])
 
+    def __repr__(self) -> str:
+        codes = summary(self.codes)
+        return f"Model({self.name!r}, {len(self.shapes)} shapes, codes={codes}, {self.decoder.specs.size})"
+
     def code_of(self, shape: str) -> Float[Tensor, "length"]:
-        """Of a shape that it was trained on, by name."""
+        """Returns the code of a training shape. Raises `ValueError` for a name that the model has not."""
+        if shape not in self.shapes:
+            close = get_close_matches(shape, self.shapes, cutoff=0.4)
+            proposal = f"did you mean {' or '.join(close)}?" if close else "see `model.shapes`"
+            raise ValueError(f"{self.name} has no shape {shape!r}; {proposal}")
         return self.codes[self.shapes.index(shape)]
 
     def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
@@ -89,8 +105,9 @@ def load_model(name: str | Path) -> Model:
     return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
 
 
-def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
+def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
     """Writes our own, smaller form into a folder: weight norm multiplied out, in half precision."""
+    folder = Path(folder)
     specs = model.decoder.specs
     plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
     tensors = {key: value for key, value in model.decoder.state_dict().items() if "parametrizations" not in key}
@@ -102,8 +119,9 @@ def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -
         file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
 
 
-def save_experiment(folder: Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
+def save_experiment(folder: str | Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
     """Writes DeepSDF's own layout, with the key names that its original code reads."""
+    folder = Path(folder)
     _write_specs(folder, decoder.specs, shapes)
     write_weights(folder, decoder, codes)
 

@@ -29,14 +29,28 @@ def asked(sdf: SDF, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"
     return values
 
 
+def check_field(field: object) -> None:
+    """Raises `TypeError` for what is no field; of a model, which holds many, it names the call that gives one.
+
+    >>> check_field(lambda points: points.norm(dim=-1) - 0.5)
+    """
+    kind = type(field).__name__
+    if callable(getattr(field, "field", None)):  # a model, or its decoder
+        raise TypeError(f"a {kind} was given where a field is needed; take the one of a shape, model.field(code)")
+    if not callable(field):
+        raise TypeError(f"a {kind} was given where a field is needed; give a function from points to distances")
+
+
 def value_and_gradient(
     sdf: SDF, points: Float[Tensor, "*batch 3"], *, second_order: bool = True
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:
     """The field's value and its gradient ∇f at each point, from one evaluation.
 
     Where grad mode is on both are differentiable; without `second_order` the gradient is a constant, at half the cost.
-    Raises `ValueError` for a field that autograd does not see through.
+    Raises `ValueError` for a field that autograd does not see through, and under `torch.inference_mode`.
     """
+    if torch.is_inference_mode_enabled() or points.is_inference():
+        raise ValueError("torch.inference_mode keeps no gradient, which a normal is; use torch.no_grad instead")
     keep_graph = torch.is_grad_enabled()
     with torch.enable_grad():
         points = points if points.requires_grad else points.detach().requires_grad_()
@@ -47,7 +61,8 @@ def value_and_gradient(
                 " torch.no_grad, or does it detach its points?"
             )
         twice = keep_graph and second_order
-        (gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=keep_graph, create_graph=twice)
+        with torch.autocast(points.device.type, enabled=False):
+            (gradient,) = torch.autograd.grad(value.sum(), points, retain_graph=keep_graph, create_graph=twice)
     return value if keep_graph else value.detach(), gradient
 
 
@@ -110,7 +125,11 @@ class Counted:
     """The same field, counting the points that it was asked for."""
 
     def __init__(self, sdf: SDF) -> None:
-        self.sdf, self.evaluations = sdf, 0
+        self.sdf = sdf
+        self.evaluations = 0
+
+    def __repr__(self) -> str:
+        return f"Counted({self.sdf!r}, {self.evaluations:,} evaluations)"
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         self.evaluations += points.numel() // 3

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from distrace.equality import summary
 from distrace.fields.base import SDF, flattened
 
 Single = TypeVar("Single", bound=SDF)
@@ -29,6 +30,9 @@ class BatchField(Generic[Single]):
     ) -> None:
         """`single` makes one shape's field from its code."""
         self.codes, self.evaluate, self.single = codes, evaluate, single
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} shapes, codes={summary(self.codes)})"
 
     def __len__(self) -> int:
         return len(self.codes)
@@ -67,7 +71,11 @@ class Selection:
     """A field of points [..., n, 3] that belong to different shapes, as `BatchField.select` says."""
 
     def __init__(self, values: Callable[[Tensor, Tensor], Tensor], shape: Int[Tensor, "n"]) -> None:
-        self.values, self.shape = values, shape
+        self.values = values
+        self.shape = shape
+
+    def __repr__(self) -> str:
+        return f"Selection(shape={summary(self.shape)})"
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         """Raises `ValueError` for another number of points along the last batch axis."""

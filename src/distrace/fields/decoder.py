@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import weight_norm
 
+from distrace.equality import summary
 from distrace.fields.base import SDF, flattened, in_chunks
 from distrace.fields.batch import BatchField
 from distrace.fields.products import Layer, Product, evaluated, joined, linear
@@ -36,6 +37,12 @@ class NetworkSpecs:
     use_tanh: bool = False
     dropout: tuple[int, ...] = ()
     dropout_prob: float = 0.0
+
+    @property
+    def size(self) -> str:
+        """Returns the hidden layers in words: `8 × 512`, or their widths one by one."""
+        widths = set(self.dims)
+        return f"{len(self.dims)} × {widths.pop()}" if len(widths) == 1 else "-".join(map(str, self.dims))
 
 
 class Decoder(nn.Module):
@@ -84,9 +91,7 @@ class Decoder(nn.Module):
 
         Under autocast points and code keep their precision: in bfloat16 a point at 0.8 would be off by up to 0.002.
         """
-        with torch.autocast(points.device.type, enabled=False):
-            layers = self.folded(code)
-        return self._run(layers, points)
+        return self._run(self.folded(code), points)
 
     def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField[ShapeField]":
         """The signed distance field of one shape or, from codes [B, length], the field of B shapes.
@@ -114,14 +119,18 @@ class Decoder(nn.Module):
         return code
 
     def folded(self, code: Float[Tensor, "*batch length"]) -> list[Layer]:
-        """Each layer's weight without the code's columns, and its bias with what the code adds: [*batch, outputs]."""
+        """Returns each layer's weight without the code's columns, and its bias with the code's part [*batch, outputs].
+
+        Both keep their precision under autocast.
+        """
         layers, length = [], self.specs.code_length
         for layer in range(self.depth):
             linear = getattr(self, f"lin{layer}")
             weight, bias = linear.weight, linear.bias
             if layer == 0 or layer in self.specs.latent_in:
                 start = weight.shape[1] - length - 3
-                bias = F.linear(code, weight[:, start : start + length], bias)
+                with torch.autocast(code.device.type, enabled=False):
+                    bias = F.linear(code, weight[:, start : start + length], bias)
                 weight = torch.cat([weight[:, :start], weight[:, start + length :]], dim=1)
             layers.append((weight, bias))
         return layers
@@ -156,7 +165,7 @@ class Evaluation:
         self.products = [Product.of(layer, decoder.is_fed(number)) for number, layer in enumerate(layers)]
 
     def __call__(self, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
-        """Raises `ValueError` for points of another precision than the decoder's."""
+        """Keeps its precision under autocast. Raises `ValueError` for points of another one than the decoder's."""
         weight = self.layers[0][0]
         if points.dtype != weight.dtype:
             raise ValueError(
@@ -167,13 +176,15 @@ class Evaluation:
         quick = on_cpu and not torch.is_grad_enabled() and not self.decoder.has_layer_norms
         quick = quick and not self.decoder.training and not torch._C._are_functorch_transforms_active()
         size = RECORDED_CHUNK if on_cpu and not quick else CHUNK
-        return in_chunks(self._quick if quick else self._recorded, size, points, *([] if shape is None else [shape]))
+        rows = (points,) if shape is None else (points, shape)
+        with torch.autocast(points.device.type, enabled=False):  # in bfloat16 surfaces would be off by 1e-3
+            return in_chunks(self._quick if quick else self._recorded, size, *rows)
 
     def _quick(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
         return self.decoder.ended(evaluated(self.products, points, shape))
 
     def _recorded(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
-        """By operations that autograd, autocast and `torch.func` see through."""
+        """By operations that autograd and `torch.func` see through."""
         layers = self.layers if shape is None else [(w, b if b.dim() == 1 else b[shape]) for w, b in self.layers]
         return self.decoder._run(layers, points)
 
@@ -184,6 +195,9 @@ class ShapeField:
     def __init__(self, decoder: Decoder, layers: list[Layer], code: Float[Tensor, "length"] | None = None) -> None:
         self.decoder, self.layers, self.code = decoder, layers, code
         self.evaluate = Evaluation(decoder, layers)
+
+    def __repr__(self) -> str:
+        return f"ShapeField({self.decoder.specs.size}, code={summary(self.code)})"
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return flattened(self.evaluate, points)

@@ -67,7 +67,8 @@ class BFloat16Decoder:
     ) -> Float[Tensor, "n"]:
         if shape is not None:
             shape = padded_rows(shape)
-        values = self._run(layers, padded_rows(points), shape).float()
+        with torch.autocast(points.device.type, enabled=False):  # products are in bfloat16 as it is
+            values = self._run(layers, padded_rows(points), shape).float()
         return values if len(values) == len(points) else values[: len(points)]
 
     def _run(

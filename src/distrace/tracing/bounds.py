@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional as F
 
+from distrace.equality import ByValue
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.rays import Bounds, Rays
@@ -25,8 +26,8 @@ FLAT = 0.01  # of the steepest gradient, and of the least value a radius: what i
 BAND = 0.018  # radii: a field that is flat wherever it was measured may rise to that within so much of its surface
 
 
-@dataclass(frozen=True)
-class Occupancy:
+@dataclass(frozen=True, eq=False, repr=False)
+class Occupancy(ByValue):
     """The cells around the unit sphere that may hold surface, and their neighbours, for each shape of a batch."""
 
     occupied: Bool[Tensor, "shapes n n n"]

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from distrace.equality import ByValue
+from distrace.equality import ByValue, summary
 from distrace.fields.base import SDF, asked, at_rows
 from distrace.rays import Bounds, Rays
 
@@ -23,8 +23,8 @@ class Outcome(IntEnum):
     INSIDE = 3  # starts in the solid
 
 
-@dataclass(frozen=True)
-class TraceConfig:
+@dataclass(frozen=True, eq=False, repr=False)
+class TraceConfig(ByValue):
     """How rays are marched: t ← t + step_scale · f, until |f| < tolerance."""
 
     steps: int = 400
@@ -60,7 +60,7 @@ COARSE_TO_FINE = replace(AGGRESSIVE, coarse_levels=2)
 MARCHES = {"parallel": PARALLEL, "dynamic": DYNAMIC, "aggressive": AGGRESSIVE, "coarse_to_fine": COARSE_TO_FINE}
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trace(ByValue):
     """Where rays ended. Distances are along the unit ray; `inf` where a ray did not hit."""
 
@@ -78,6 +78,9 @@ class Trace(ByValue):
     @property
     def total_evaluations(self) -> int:
         return self.setup_evaluations + int(self.evaluations.sum())
+
+    def __repr__(self) -> str:
+        return f"Trace({summary(self.distance)}, {int(self.hit.sum()):,} hits, {self.total_evaluations:,} evaluations)"
 
     def reshaped(self, shape: torch.Size) -> "Trace":
         return self.of(lambda part: part.reshape(shape))

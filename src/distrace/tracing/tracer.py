@@ -57,8 +57,9 @@ def trace_images(
     views = camera.intrinsics.shape[:-2].numel()
     if isinstance(sdf, BatchField) and len(sdf) != views:
         raise ValueError(f"a field of {len(sdf)} shapes and {views} cameras were given; give a camera for each shape")
-    pixels = Pixels.of_camera(camera, rays, radius, LARGEST)
-    return _traced(sdf, pixels, radius, config, occupancy)
+    with torch.autocast(rays.origins.device.type, enabled=False):  # distances need their precision
+        pixels = Pixels.of_camera(camera, rays, radius, LARGEST)
+        return _traced(sdf, pixels, radius, config, occupancy)
 
 
 @torch.no_grad()
@@ -68,8 +69,9 @@ def trace_rays(
     """The same for rays [n] that are no image: each is marched on its own. Raises `ValueError` as `trace_images`."""
     if isinstance(sdf, BatchField):
         raise ValueError(f"a field of {len(sdf)} shapes was given with rays; give one of them, as `field[0]`")
-    pixels = Pixels.of_rays(Rays(rays.origins / radius, rays.directions))
-    return _traced(sdf, pixels, radius, config, occupancy)
+    with torch.autocast(rays.origins.device.type, enabled=False):
+        pixels = Pixels.of_rays(Rays(rays.origins / radius, rays.directions))
+        return _traced(sdf, pixels, radius, config, occupancy)
 
 
 def _traced(
