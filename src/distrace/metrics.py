@@ -18,18 +18,22 @@ POINTS = 30_000  # on each mesh
 class Chamfer:
     """Mean squared distances × 1000 between two surfaces, in the frame of the unit sphere."""
 
-    to: float  # from the predicted surface to the true one: what is there and should not be
-    from_: float  # from the true surface to the predicted one: what is missing
+    to: float  # from the predicted surface to the true one: surplus surface
+    from_: float  # from the true surface to the predicted one: missing surface
 
     @property
     def sum(self) -> float:
+        """Both directions together."""
         return self.to + self.from_
 
 
 def chamfer(predicted: "trimesh.Trimesh | np.ndarray", truth: "trimesh.Trimesh | np.ndarray", seed: int = 0) -> Chamfer:
-    """Chamfer distance of two meshes (30,000 points on each) or clouds [n, 3]: squared, × 1000, each direction its own.
+    """Returns the Chamfer distance of two meshes (30,000 points on each) or clouds [n, 3]: squared, × 1000.
 
     Raises `ValueError` for an empty surface.
+
+    >>> chamfer(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]))
+    Chamfer(to=10.0, from_=10.0)
     """
     from scipy.spatial import KDTree
 
@@ -41,14 +45,14 @@ def chamfer(predicted: "trimesh.Trimesh | np.ndarray", truth: "trimesh.Trimesh |
 
 
 def surface_points(mesh: "trimesh.Trimesh", count: int, seed: int) -> Float[np.ndarray, "count 3"]:
-    """Points spread evenly over a mesh."""
+    """Returns points spread evenly over a mesh."""
     from trimesh.sample import sample_surface
 
     return np.asarray(sample_surface(mesh, count, seed=seed)[0])
 
 
 def _cloud(surface: "trimesh.Trimesh | np.ndarray", seed: int) -> Float[np.ndarray, "n 3"]:
-    """Points of a mesh; a cloud is taken as it is."""
+    """Returns points of a mesh; a cloud stays as it is."""
     import trimesh
 
     if isinstance(surface, trimesh.Trimesh):
@@ -57,18 +61,22 @@ def _cloud(surface: "trimesh.Trimesh | np.ndarray", seed: int) -> Float[np.ndarr
         return surface_points(surface, POINTS, seed)
     points = np.asarray(surface)
     if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        given = list(points.shape)
-        raise ValueError(f"points of shape {given} were given; chamfer takes meshes or clouds of shape [n, 3]")
+        shape = list(points.shape)
+        raise ValueError(f"points of shape {shape} were given; chamfer takes meshes or clouds of shape [n, 3]")
     return points
 
 
 def iou(first: Bool[Tensor, "*shape"], second: Bool[Tensor, "*shape"]) -> float:
-    """Intersection over union of two masks; 1 where both are empty."""
+    """Returns the intersection over union of two masks; 1 if both are empty.
+
+    >>> iou(torch.tensor([True, True]), torch.tensor([True, False]))
+    0.5
+    """
     union = (first | second).sum()
     return float((first & second).sum() / union) if union else 1.0
 
 
 def depth_errors(depth: Float[Tensor, "*shape"], reference: Float[Tensor, "*shape"]) -> Float[Tensor, "n"]:
-    """|depth - reference| at the pixels that both see."""
-    seen = torch.isfinite(depth) & torch.isfinite(reference)
-    return (depth[seen] - reference[seen]).abs()
+    """Returns |depth − reference| at the pixels where both are finite."""
+    both = torch.isfinite(depth) & torch.isfinite(reference)
+    return (depth[both] - reference[both]).abs()

@@ -26,12 +26,15 @@ from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
-VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Model(ByValue):
-    """A trained decoder and the codes of the shapes it was trained on. Weights are frozen: `requires_grad_()` thaws."""
+    """A trained decoder, and the codes [shapes, length] of the shapes that it was trained on.
+
+    `load_model` returns one. Weights are frozen; `model.decoder.requires_grad_()` unfreezes them.
+    """
 
     name: str
     decoder: Decoder
@@ -45,9 +48,13 @@ class Model(ByValue):
     def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]: ...
 
     def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
-        """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
+        """Returns the signed distance field of a training code, of any code, or of B shapes from codes [B, length].
 
         Raises `ValueError` for a number or a length that the model has not.
+
+        >>> model = load_model("sofas")
+        >>> model.field(0)(torch.zeros(5, 3)).shape
+        torch.Size([5])
         """
         if isinstance(code, Tensor | np.ndarray):
             return self.decoder.field(code)
@@ -67,29 +74,33 @@ class Model(ByValue):
             raise ValueError(f"{self.name} has no shape {shape!r}; {proposal}")
         return self.codes[self.shapes.index(shape)]
 
-    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
-        """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
-        known, mean = dict(zip(self.shapes, self.codes, strict=True)), self.codes.mean(0)
-        return torch.stack([known.get(shape, known.get(original(shape), mean)) for shape in shapes])
+    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "n length"]:
+        """Returns codes by name: of an unknown variant its original's, of other unknown shapes the mean code."""
+        code_of = dict(zip(self.shapes, self.codes, strict=True))
+        mean = self.codes.mean(0)
+        return torch.stack([code_of.get(shape, code_of.get(original(shape), mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
 
 
 def original(shape: str) -> str:
-    """The name of what a variant was made of; of other shapes their own."""
+    """Returns the name of the shape that a variant was made from; of other shapes their own."""
     return shape.split(VARIANT)[0]
 
 
 def bundled_models() -> list[str]:
-    """The names that `load_model` knows without a folder."""
+    """Returns the names of the bundled models."""
     return sorted(path.parent.name for path in BUNDLED.glob("*/specs.json"))
 
 
 def load_model(name: str | Path) -> Model:
-    """A bundled model by name, or any DeepSDF experiment folder.
+    """Loads a bundled model by name, or any DeepSDF experiment folder.
 
     Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
+
+    >>> load_model("sofas")
+    Model('sofas', 657 shapes, codes=float32[657, 256], 8 × 512)
     """
     folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
     if not folder.is_dir():
@@ -106,7 +117,10 @@ def load_model(name: str | Path) -> Model:
 
 
 def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
-    """Writes our own, smaller form into a folder: weight norm multiplied out, in half precision."""
+    """Writes a model into a folder, in distrace's own, smaller form: weight norm multiplied out, in half precision.
+
+    `load_model(folder)` reads it.
+    """
     folder = Path(folder)
     specs = model.decoder.specs
     plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
@@ -179,14 +193,15 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
 
 def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
     if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
-        given, wanted = list(codes.shape), f"[n, {specs.code_length}]"
-        raise ValueError(f"{folder} has codes of shape {given}, but specs.json asks for {wanted}")
+        raise ValueError(
+            f"{folder} has codes of shape {list(codes.shape)}, but specs.json asks for [n, {specs.code_length}]"
+        )
     if not codes.isfinite().all():
         raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
 
 
 def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
-    """The decoder with the weights put in, after a look at each: their names, shapes and values."""
+    """Returns the decoder with the weights, whose names, shapes and values are checked."""
     expected = decoder.state_dict()
     for key in sorted(expected.keys() | state.keys()):
         if key not in state:
@@ -194,8 +209,8 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
         if key not in expected:
             raise ValueError(f"{source} has {key}, for which specs.json has no place")
         if state[key].shape != expected[key].shape:
-            given, wanted = list(state[key].shape), list(expected[key].shape)
-            raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
+            shapes = f"has shape {list(state[key].shape)}, but specs.json asks for {list(expected[key].shape)}"
+            raise ValueError(f"{source}: {key} {shapes}")
         if state[key].layout != torch.strided:
             raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")
         if not state[key].isfinite().all():

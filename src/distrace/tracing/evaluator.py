@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from distrace.fields.base import SDF, Counted, asked
+from distrace.fields.base import SDF, Counted, evaluate_checked
 from distrace.fields.batch import BatchField, CountedBatch
 from distrace.fields.decoder import ShapeField
 from distrace.fields.precision import fastest
@@ -47,7 +47,7 @@ class Evaluator:
         if isinstance(field, BatchField):
             values = field.values(world, points.new_zeros(1, dtype=torch.int64) if shape is None else shape)
         else:
-            values = asked(field, world)
+            values = evaluate_checked(field, world)
         if self.scale is None:
             return values if self.radius == 1 else values / self.radius
         return values * (self.scale[shape] if self.shapes > 1 else self.scale)

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from distrace.equality import ByValue, summary
-from distrace.fields.base import SDF, asked, at_rows
+from distrace.fields.base import SDF, at_rows, evaluate_checked
 from distrace.rays import Bounds, Rays
 
 
@@ -182,7 +182,7 @@ class _March:
             return False
         queried = under_way if config.compaction else (self.limits[0] < self.limits[1]).nonzero()[:, 0]
         self.evaluations[queried] += 1
-        value = asked(at_rows(sdf, queried), self.rays[queried].at(self.rows.t[queried]))
+        value = evaluate_checked(at_rows(sdf, queried), self.rays[queried].at(self.rows.t[queried]))
         if not config.compaction:
             value = value[self.outcome[queried] == -1]
         outcome, state = _advanced(_State(*self.state[:, under_way]), value, self.limits[:, under_way], config)
