@@ -6,12 +6,17 @@ from contextlib import contextmanager
 
 
 class DoubtfulResult(UserWarning):
-    """A result that was made, but that is probably not what was meant; one sentence says why."""
+    """Warns of a result that is probably not the one intended; its sentence says why.
+
+    >>> import warnings
+    >>> warnings.simplefilter("error", DoubtfulResult)  # makes it an exception
+    >>> warnings.simplefilter("default", DoubtfulResult)
+    """
 
 
 @contextmanager
 def explained(sentence: str) -> Iterator[None]:
-    """Anything that goes wrong inside is raised again as `ValueError(sentence)`; Ctrl-C passes through."""
+    """Raises any error inside again as `ValueError(sentence)`; Ctrl-C passes through."""
     try:
         yield
     except Exception as error:
@@ -22,7 +27,7 @@ def explained(sentence: str) -> Iterator[None]:
 
 @contextmanager
 def about(subject: object) -> Iterator[None]:
-    """A `ValueError` inside is raised again with what it is about before it."""
+    """Raises a `ValueError` inside again, with its subject in front."""
     try:
         yield
     except ValueError as error:

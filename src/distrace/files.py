@@ -14,7 +14,7 @@ from torch import Tensor
 
 @contextmanager
 def written(path: str | Path) -> Iterator[BinaryIO]:
-    """A file to write; it takes the name `path` only once all of it is on the disk."""
+    """Opens a file to write; it gets the name `path` once all of it is on the disk."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -30,7 +30,7 @@ def written(path: str | Path) -> Iterator[BinaryIO]:
 
 @contextmanager
 def alone(folder: str | Path) -> Iterator[None]:
-    """Keeps a folder to one process, for as long as it runs. Raises `ValueError` where another has it."""
+    """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
     try:
         held = FileLock(Path(folder) / ".lock").acquire(blocking=False)
     except Timeout:
@@ -40,17 +40,19 @@ def alone(folder: str | Path) -> Iterator[None]:
 
 
 def save_text(path: str | Path, text: str) -> None:
+    """Writes a text in UTF-8."""
     with written(path) as file:
         file.write(text.encode())
 
 
 def save_json(path: str | Path, content: Any) -> None:
+    """Writes JSON; numbers of other types become floats."""
     with written(path) as file:
         file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
 
 
 def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
-    """An `.npz` of tensors."""
+    """Writes tensors as `.npz`."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
     with written(path) as file:
         np.savez_compressed(file, **content)

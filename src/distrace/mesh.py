@@ -55,8 +55,9 @@ class MeshConfig:
 def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> "trimesh.Trimesh":
     """Returns the surface of a field, by marching cubes (Lorensen and Cline, SIGGRAPH 1987).
 
-    Only cells that can hold the surface are evaluated. Normals point out. Raises `ValueError` where the field has no zero in the cube. Warns by `DoubtfulResult` of a field
-    that is NaN at points in the ball, whose mesh may be open, and of one that is negative all around the ball.
+    Only cells that can hold the surface are evaluated. Normals point out. Raises `ValueError` where the field has no
+    zero in the cube. Warns `DoubtfulResult` of a field that is NaN at points in the ball, whose mesh may be open, and
+    of one that is negative all around the ball.
 
     >>> from distrace.fields import primitives
     >>> mesh = extract_mesh(primitives.sphere(0.5), MeshConfig(resolution=32))

@@ -152,7 +152,8 @@ class Buffers(ByValue):
     def footprint_normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals averaged over FOOTPRINT pixels, in world axes, zero where nothing was hit.
 
-        Use them in a loss: on a ReLU network the derivative of `normal` is zero, and theirs is not. Costs 32 evaluations per hit.
+        Use them in a loss: on a ReLU network the derivative of `normal` is zero, and theirs is not. Costs 32
+        evaluations per hit.
         """
         normals = surface.footprint_normals(self.field_at(self.mask), self.points, self.footprint_widths)
         return torch.zeros_like(self.rays.directions).masked_scatter(self.mask[..., None], normals)
@@ -210,8 +211,8 @@ def render(
 ) -> Buffers:
     """Renders a field inside a sphere of `radius` around the origin, as a camera sees it.
 
-    `sdf` maps points [N, 3] to distances [N]. A field of B shapes (`model.field(codes)`) takes a batch of B cameras, and
-    gives the images of B single calls. `radius` should tightly bound the surface: a configuration's lengths are
+    `sdf` maps points [N, 3] to distances [N]. A field of B shapes (`model.field(codes)`) takes a batch of B cameras,
+    and gives the images of B single calls. `radius` should tightly bound the surface: a configuration's lengths are
     relative to it. Pass `occupancy=buffers.occupancy` to render another view of the same field without measuring the
     field again.
 
