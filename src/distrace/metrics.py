@@ -32,8 +32,8 @@ def chamfer(predicted: "trimesh.Trimesh | np.ndarray", truth: "trimesh.Trimesh |
 
     Raises `ValueError` for an empty surface.
 
-    >>> chamfer(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]]))
-    Chamfer(to=10.0, from_=10.0)
+    >>> print(f"{chamfer(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.1]])).sum:.1f}")
+    20.0
     """
     from scipy.spatial import KDTree
 

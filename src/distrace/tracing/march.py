@@ -15,24 +15,8 @@ Schedule = tuple[tuple[int, ...], ...]
 """The samples of each ray in each query; the active rays are compacted after each group."""
 CONES = 5  # queries of the cones of one size
 ROUGH: Schedule = ((1, 1), (2, 3))  # of single rays by bfloat16 values …
-EXACT: Schedule = (
-    (1,),
-    (1,),
-    (4,),
-    (8,),
-    (16,),
-    (32,),
-    *[(256,)] * 42,
-)  # … and then by exact ones; some graze
-EXACT_ALONE: Schedule = (
-    *[(1,)] * 4,
-    *[(2,)] * 2,
-    *[(4,)] * 2,
-    (8,),
-    (16,),
-    (32,),
-    *[(256,)] * 37,
-)  # by exact ones alone
+EXACT: Schedule = ((1,), (1,), (4,), (8,), (16,), (32,), *[(256,)] * 42)  # … and then by exact ones; some graze
+EXACT_ALONE: Schedule = (*[(1,)] * 4, *[(2,)] * 2, *[(4,)] * 2, (8,), (16,), (32,), *[(256,)] * 37)  # by exact ones
 BRACKET = 2  # tolerances: in a shorter bracket the secant's root is the hit
 OVERSHOOT = 0.1  # tolerances behind a root, for the next query: only a point inside ends a ray
 FLAT = torch.tensor(1e-6)  # the least slope, so that secants have a root

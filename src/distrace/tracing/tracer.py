@@ -139,9 +139,9 @@ def _marched(
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
     given = len(occupancy.occupied)
     shapes = evaluator.shapes
-    radius = evaluator.radius
-    if occupancy.radius != radius:
-        raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
+    if occupancy.radius != evaluator.radius:
+        radii = f"an occupancy for a radius of {occupancy.radius} was given with {evaluator.radius}"
+        raise ValueError(f"{radii}; leave it out")
     if given != shapes:
         raise ValueError(f"an occupancy of {given} shapes was given with a field of {shapes}; leave the occupancy out")
     if lipschitz is not None and (occupancy.lipschitz != lipschitz).any():
