@@ -8,7 +8,7 @@
 (torch.Size([64, 64]), torch.Size([64, 64, 3]))
 """
 
-from distrace import threads as _threads  # noqa: F401  # isort: skip – must precede torch
+from distrace import threads as threads  # isort: skip – it must precede torch
 
 from distrace import losses
 from distrace.boundary import shade

@@ -29,7 +29,7 @@ class ByValue:
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
-def summary(value: object) -> str:
+def summary(value: Any) -> str:
     """Returns a value in a few words: of a tensor its type, shape and device, but for numbers, which are written out.
 
     >>> summary(torch.zeros(512, 512))

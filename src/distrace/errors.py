@@ -1,7 +1,7 @@
 """Errors and warnings of one sentence, whatever a library raised underneath."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 
@@ -15,7 +15,7 @@ class DoubtfulResult(UserWarning):
 
 
 @contextmanager
-def explained(sentence: str) -> Iterator[None]:
+def explained(sentence: str) -> Generator[None, None, None]:
     """Raises any error inside again as `ValueError(sentence)`; Ctrl-C passes through."""
     try:
         yield
@@ -26,7 +26,7 @@ def explained(sentence: str) -> Iterator[None]:
 
 
 @contextmanager
-def about(subject: object) -> Iterator[None]:
+def about(subject: object) -> Generator[None, None, None]:
     """Raises a `ValueError` inside again, with its subject in front."""
     try:
         yield

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 @contextmanager
-def written(path: str | Path) -> Iterator[BinaryIO]:
+def written(path: str | Path) -> Generator[BinaryIO, None, None]:
     """Opens a file to write; it gets the name `path` once all of it is on the disk."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -29,7 +29,7 @@ def written(path: str | Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def alone(folder: str | Path) -> Iterator[None]:
+def alone(folder: str | Path) -> Generator[None, None, None]:
     """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
     try:
         held = FileLock(Path(folder) / ".lock").acquire(blocking=False)

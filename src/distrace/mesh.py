@@ -173,6 +173,7 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
     coarse = torch.arange(config.resolution >> LEVELS, device=config.device)
     cells = torch.cartesian_prod(coarse, coarse, coarse)
     halves = _offsets(config.device)
+    field = sdf
     for level in range(LEVELS, 0, -1):
         width = config.width * 2**level
         centres = (cells + 0.5) * width - config.radius

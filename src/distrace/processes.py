@@ -2,7 +2,7 @@
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
@@ -50,7 +50,7 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _deaf_children() -> Iterator[None]:
+def _deaf_children() -> Generator[None, None, None]:
     """Starts processes that ignore Ctrl-C, which a terminal sends to all of them: the parent handles it."""
     if current_thread() is not main_thread():  # only the main thread may set signal handlers
         yield

@@ -83,7 +83,7 @@ class Buffers(ByValue):
     `[*batch, height, width]` of the camera; lengths are in the units of the world.
     """
 
-    sdf: SDF | BatchField  # of one shape, or of the shape of each camera
+    sdf: SDF | BatchField[Any]  # of one shape, or of the shape of each camera
     rays: Rays
     cosines: Float[Tensor, "*batch"]  # depth over distance
     trace: Trace
@@ -190,8 +190,9 @@ class Buffers(ByValue):
             missed = missed & ~excluded
         rays = self.rays[missed]
         bounds = meet_sphere(rays.detach(), self.radius)
-        options = {} if self.occupancy is None else {"reach": CLEARANCE_REACH * self.radius, "refine": 3}
-        values = surface.clearance(self.field_at(missed), rays, closest[missed], bounds, **options)
+        reach = 0.1 if self.occupancy is None else CLEARANCE_REACH * self.radius
+        refine = None if self.occupancy is None else 3
+        values = surface.clearance(self.field_at(missed), rays, closest[missed], bounds, reach=reach, refine=refine)
         return least.masked_scatter(missed, values)
 
     def _shapes(self, chosen: Bool[Tensor, "*batch"]) -> Int[Tensor, "n"]:
@@ -202,7 +203,7 @@ class Buffers(ByValue):
 
 
 def render(
-    sdf: SDF | BatchField,
+    sdf: SDF | BatchField[Any],
     camera: Camera,
     *,
     radius: float = 1.0,

@@ -1,6 +1,6 @@
 """A decoder's layers as matrix products: differentiable ones, and ones without derivatives in two reused buffers."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
 
@@ -100,7 +100,7 @@ def evaluate_layers(
 
 
 @contextmanager
-def _buffer(like: Tensor, size: int) -> Iterator[Float[Tensor, "_"]]:
+def _buffer(like: Tensor, size: int) -> Generator[Float[Tensor, "_"], None, None]:
     """Lends memory for `size` numbers, kept for later calls: page faults of fresh memory take a sixth of the time.
 
     A concurrent call in another thread allocates its own.

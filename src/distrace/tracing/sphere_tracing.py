@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -85,7 +85,7 @@ class Trace(ByValue):
     def reshaped(self, shape: torch.Size) -> "Trace":
         return self.of(lambda part: part.reshape(shape))
 
-    def __getitem__(self, index: Tensor | tuple) -> "Trace":
+    def __getitem__(self, index: Tensor | tuple[Any, ...]) -> "Trace":
         return self.of(lambda part: part[index])
 
     def of(self, change: Callable[[Tensor], Tensor]) -> "Trace":
