@@ -237,6 +237,23 @@ def test_a_code_that_the_model_has_not_is_named(tmp_path):
         model.field(torch.zeros(5))
 
 
+def test_a_shape_that_the_model_has_not_names_close_ones():
+    model = load_model("sofas")
+    with pytest.raises(ValueError, match=r"^sofas has no shape 'nope'; see `model\.shapes`$"):
+        model.code_of("nope")
+    with pytest.raises(ValueError, match=r"'beige-sofa-2-seat'; did you mean beige-sofa-2-seats or"):
+        model.code_of("beige-sofa-2-seat")
+
+
+def test_a_model_is_equal_by_value_and_fits_on_a_line(tmp_path):
+    model = load_model(experiment(tmp_path / "chairs"))
+    assert repr(model) == "Model('chairs', 4 shapes, codes=float32[4, 3], 12-13-14)"
+    assert repr(model.field(0)) == "ShapeField(12-13-14, code=float32[3])"
+    assert repr(model.field(model.codes)) == "BatchField(4 shapes, codes=float32[4, 3])"
+    assert model == replace(model, codes=model.codes.clone())
+    assert model != replace(model, codes=model.codes + 1)
+
+
 def test_a_name_that_is_nothing_lists_the_bundled_models(tmp_path, monkeypatch):
     save_model(tmp_path / "lamps", load_model(experiment(tmp_path / "experiment")))
     monkeypatch.setattr("distrace.checkpoints.model.BUNDLED", tmp_path)
@@ -546,7 +563,7 @@ def files(folder: Path) -> dict[str, bytes]:
 def test_saving_leaves_no_parts_behind(tmp_path):
     model = a_model(SPECS)
     for _ in range(2):
-        save_model(tmp_path / "ours", model)
+        save_model(str(tmp_path / "ours"), model)
         save_experiment(tmp_path / "theirs", model.decoder, model.codes, model.shapes)
     assert set(files(tmp_path / "ours")) == {"specs.json", "model.safetensors"}
     assert set(files(tmp_path / "theirs")) == {"specs.json", str(WEIGHTS), str(LATENTS)}

@@ -178,18 +178,18 @@ def a_place(points: torch.Tensor) -> torch.Tensor:
     return 0.05 * points + torch.tensor([0.4, -0.3, 0.2], dtype=torch.float64)
 
 
-def test_a_narrowed_field_has_the_same_values_at_its_points(decoder, points):
+def test_a_pruned_field_has_the_same_values_at_its_points(decoder, points):
     field, here = decoder.field(a_code(decoder)), a_place(points)
-    values, narrow = field.narrowed(here)
+    values, pruned_field = field.pruned(here)
     torch.testing.assert_close(values, field(here).detach(), rtol=0, atol=0)
-    torch.testing.assert_close(narrow(here), values, rtol=0, atol=1e-12)
+    torch.testing.assert_close(pruned_field(here), values, rtol=0, atol=1e-12)
 
 
-def test_a_narrowed_field_has_never_more_units(decoder, points):
+def test_a_pruned_field_has_never_more_units(decoder, points):
     field = decoder.field(a_code(decoder))
-    _, narrow = field.narrowed(points)
-    assert all(few <= many for few, many in zip(units(narrow), units(field), strict=True))
-    assert units(narrow)[-1] == 1
+    _, pruned_field = field.pruned(points)
+    assert all(few <= many for few, many in zip(units(pruned_field), units(field), strict=True))
+    assert units(pruned_field)[-1] == 1
 
 
 def wide() -> tuple[Decoder, ShapeField]:
@@ -199,65 +199,65 @@ def wide() -> tuple[Decoder, ShapeField]:
 
 def test_around_a_small_place_many_units_are_off(points):
     _, field = wide()
-    _, narrow = field.narrowed(a_place(points))
-    assert sum(units(narrow)) < 0.75 * sum(units(field))
-    assert all(width % 16 == 0 for width in units(narrow)[:-1])
+    _, pruned_field = field.pruned(a_place(points))
+    assert sum(units(pruned_field)) < 0.75 * sum(units(field))
+    assert all(width % 16 == 0 for width in units(pruned_field)[:-1])
 
 
 @pytest.mark.parametrize("size", [0.1, 0.3, 0.6, 1.0])
 def test_no_unit_is_lost_that_is_on_at_any_of_the_points(size, points):
     _, field = wide()
-    values, narrow = field.narrowed(size * points)
-    assert sum(units(narrow)) < sum(units(field))
-    torch.testing.assert_close(narrow(size * points), values, rtol=0, atol=1e-12)
+    values, pruned_field = field.pruned(size * points)
+    assert sum(units(pruned_field)) < sum(units(field))
+    torch.testing.assert_close(pruned_field(size * points), values, rtol=0, atol=1e-12)
 
 
-def test_near_its_points_a_narrowed_field_is_the_same_up_to_units_just_switched_on(points):
+def test_near_its_points_a_pruned_field_is_the_same_up_to_units_just_switched_on(points):
     _, field = wide()
-    _, narrow = field.narrowed(a_place(points))
+    _, pruned_field = field.pruned(a_place(points))
     beside = a_place(points.flip(-1))
-    torch.testing.assert_close(narrow(beside), field(beside), rtol=0, atol=1e-3)
-    assert (narrow(beside) - field(beside)).abs().mean() < 1e-5
+    torch.testing.assert_close(pruned_field(beside), field(beside), rtol=0, atol=1e-3)
+    assert (pruned_field(beside) - field(beside)).abs().mean() < 1e-5
 
 
-def test_a_narrowed_field_may_be_narrowed_again(points):
+def test_a_pruned_field_may_be_pruned_again(points):
     _, field = wide()
-    _, narrow = field.narrowed(points)
-    values, narrower = narrow.narrowed(a_place(points))
-    assert sum(units(narrower)) < sum(units(narrow))
+    _, pruned_field = field.pruned(points)
+    values, pruned_again = pruned_field.pruned(a_place(points))
+    assert sum(units(pruned_again)) < sum(units(pruned_field))
     torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(narrower(a_place(points)), values, rtol=0, atol=1e-12)
+    torch.testing.assert_close(pruned_again(a_place(points)), values, rtol=0, atol=1e-12)
 
 
-def test_points_of_many_chunks_are_narrowed_together(monkeypatch, points):
+def test_points_of_many_chunks_are_pruned_together(monkeypatch, points):
     decoder, _ = wide()
     monkeypatch.setattr("distrace.fields.decoder.RECORDED_CHUNK", 7)
     field = decoder.field(a_code(decoder))
-    values, narrow = field.narrowed(a_place(points))
+    values, pruned_field = field.pruned(a_place(points))
     torch.testing.assert_close(values, field(a_place(points)).detach(), rtol=0, atol=1e-12)
-    torch.testing.assert_close(narrow(a_place(points)), values, rtol=0, atol=1e-12)
+    torch.testing.assert_close(pruned_field(a_place(points)), values, rtol=0, atol=1e-12)
 
 
 def test_layer_norms_need_all_units(points):
     decoder = randomised(ARCHITECTURES["layer norm"])
     field = decoder.field(a_code(decoder))
-    values, same = field.narrowed(points)
+    values, same = field.pruned(points)
     assert same is field
     torch.testing.assert_close(values, field(points).detach())
 
 
 def test_in_training_and_without_points_a_field_stays_as_it_is(points):
     decoder, field = wide()
-    assert field.narrowed(points[:0])[1] is field
-    assert field.narrowed(points[:0])[0].shape == (0,)
+    assert field.pruned(points[:0])[1] is field
+    assert field.pruned(points[:0])[0].shape == (0,)
     decoder.train()
-    assert field.narrowed(points)[1] is field
+    assert field.pruned(points)[1] is field
 
 
-def test_values_where_a_field_is_narrowed_carry_no_gradient(points):
+def test_values_where_a_field_is_pruned_carry_no_gradient(points):
     _, field = wide()
     assert field(points).requires_grad
-    assert not field.narrowed(points)[0].requires_grad
+    assert not field.pruned(points)[0].requires_grad
 
 
 def a_selection(count: int, shapes: int) -> torch.Tensor:

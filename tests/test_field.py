@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from distrace.camera import Camera
 from distrace.fields import primitives
-from distrace.fields.base import Counted, chunked, narrowed, placed, value_and_gradient
+from distrace.fields.base import Counted, chunked, placed, pruned, value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.render import render
 from distrace.tracing.sphere_tracing import TraceConfig
@@ -61,35 +61,35 @@ def test_a_counted_field_counts_points_not_calls() -> None:
 
 
 class Halved:
-    """A field that is another one where it is narrowed: half as large."""
+    """A field that is another one where it is pruned: half as large."""
 
     def __call__(self, points: torch.Tensor) -> torch.Tensor:
         return points.norm(dim=-1)
 
-    def narrowed(self, points: torch.Tensor) -> tuple[torch.Tensor, primitives.SDF]:
+    def pruned(self, points: torch.Tensor) -> tuple[torch.Tensor, primitives.SDF]:
         return self(points), lambda others: self(others) / 2
 
 
-def test_a_plain_function_is_narrowed_to_itself() -> None:
+def test_a_plain_function_is_pruned_to_itself() -> None:
     sphere, p = primitives.sphere(0.5), points(0, 5)
-    values, same = narrowed(sphere, p)
+    values, same = pruned(sphere, p)
     assert same is sphere
     torch.testing.assert_close(values, sphere(p))
 
 
-def test_a_field_that_can_be_narrowed_is() -> None:
+def test_a_field_that_can_be_pruned_is() -> None:
     p = points(0, 5)
-    values, half = narrowed(Halved(), p)
+    values, half = pruned(Halved(), p)
     torch.testing.assert_close(values, p.norm(dim=-1))
     torch.testing.assert_close(half(p), p.norm(dim=-1) / 2)
 
 
 @pytest.mark.parametrize(("field", "factor"), [(primitives.sphere(0.0), 1.0), (Halved(), 0.5)], ids=["plain", "halved"])
-def test_a_counted_field_counts_what_it_is_narrowed_at_and_what_comes_of_that(
+def test_a_counted_field_counts_what_it_is_pruned_at_and_what_comes_of_that(
     field: primitives.SDF, factor: float
 ) -> None:
     counted, p = Counted(field), points(0, 7)
-    values, near = narrowed(counted, p)
+    values, near = pruned(counted, p)
     assert counted.evaluations == 7
     torch.testing.assert_close(values, p.norm(dim=-1))
     torch.testing.assert_close(near(points(1, 2, 4)), factor * points(1, 2, 4).norm(dim=-1))

@@ -78,8 +78,8 @@ def test_directions_are_32_and_no_axis_is_preferred() -> None:
 
 def test_many_points_in_parts_have_the_gradient_of_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     width, slopes = torch.full((50,), 0.05, dtype=f64), []
-    for part in (surface.PART, 100):
-        monkeypatch.setattr(surface, "PART", part)
+    for part in (surface.GRAPH_POINTS, 100):
+        monkeypatch.setattr(surface, "GRAPH_POINTS", part)
         centre = torch.tensor([0.1, 0.2, -0.1], dtype=f64, requires_grad=True)
         found = surface.footprint_normals(primitives.sphere(0.5, centre), on_sphere(), width)
         slopes += torch.autograd.grad(found[:, 0].square().sum(), centre)

@@ -3,11 +3,12 @@
 import math
 
 import pytest
+import roma
 import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.pose import aimed, object_in_camera, pose_error, turned_object, with_object_at, zoomed
+from distrace.pose import aimed, exp_se3, object_in_camera, pose_error, turned_object, with_object_at, zoomed
 
 f64 = torch.float64
 
@@ -70,3 +71,19 @@ def test_an_aimed_camera_sees_the_origin_on_the_pixel_from_where_it_stood(start:
     torch.testing.assert_close(seen[0], pixel)
     assert depth > 0
     torch.testing.assert_close(found.T_world_camera[:3, 3], vector(0, 0, 5))
+
+
+def test_the_exponential_of_a_twist_is_a_screw_and_batches() -> None:
+    """Half of it twice is all of it; its rotation is Rodrigues'; along the axis it shifts by the velocity alone."""
+    turns = torch.randn(5, 3, dtype=f64, generator=torch.Generator().manual_seed(0))
+    motion = exp_se3(turns, 0.7 * turns)
+    half = exp_se3(turns / 2, 0.35 * turns)
+    torch.testing.assert_close(half @ half, motion)
+    torch.testing.assert_close(motion[:, :3, :3], roma.rotvec_to_rotmat(turns))
+    torch.testing.assert_close(motion[:, :3, 3], 0.7 * turns)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1.0])
+def test_the_exponential_of_a_twist_has_the_derivatives_of_finite_differences(angle: float) -> None:
+    turn = vector(angle, -angle / 2, 0).requires_grad_()
+    assert torch.autograd.gradcheck(exp_se3, (turn, vector(0.1, 0.2, 0.3).requires_grad_()))

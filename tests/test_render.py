@@ -7,10 +7,12 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.checkpoints.model import load_model
 from distrace.fields import primitives
+from distrace.fields.base import check_field
 from distrace.rays import meet_sphere
 from distrace.render import STRATEGIES, Buffers, Config, render, render_rays
-from distrace.tracing.sphere_tracing import COARSE_TO_FINE, DYNAMIC, Outcome
+from distrace.tracing.sphere_tracing import COARSE_TO_FINE, DYNAMIC, Outcome, TraceConfig
 from distrace.tracing.tracer import TracerConfig
 
 f64 = torch.float64
@@ -238,3 +240,50 @@ def test_what_was_first_read_without_gradients_has_them_later() -> None:
         assert getattr(buffers, name).requires_grad
         assert getattr(buffers, name) is getattr(buffers, name), "made once"
         torch.testing.assert_close(getattr(buffers, name).detach(), image, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16])
+@pytest.mark.parametrize("recorded", [False, True], ids=["constant", "recorded"])
+def test_a_model_gives_the_same_images_under_autocast(dtype: torch.dtype, recorded: bool) -> None:
+    model = load_model("sofas")
+    code = model.codes[0].clone().requires_grad_(recorded)
+    expected = images(render(model.field(code), view(16, dtype=torch.float32)))
+    with torch.autocast("cpu", dtype):
+        torch.testing.assert_close(images(render(model.field(code), view(16, dtype=torch.float32))), expected)
+
+
+def images(buffers: Buffers) -> dict[str, Tensor]:
+    return {name: getattr(buffers, name).detach() for name in (*BUFFERS, "footprint_normal")}
+
+
+def test_a_normal_under_inference_mode_is_refused_by_that_name() -> None:
+    with torch.inference_mode():
+        buffers = render(primitives.sphere(0.5), view())
+        assert buffers.depth.isfinite().any()
+        with pytest.raises(ValueError, match=r"^torch\.inference_mode keeps no gradient"):
+            _ = buffers.normal
+
+
+def test_a_decoder_or_a_model_is_no_field() -> None:
+    model = load_model("sofas")
+    with pytest.raises(TypeError, match=r"^a Decoder was given where .* model\.field\(code\)$"):
+        render(model.decoder, view())
+    with pytest.raises(TypeError, match=r"^a Model was given where .* model\.field\(code\)$"):
+        check_field(model)
+    with pytest.raises(
+        TypeError, match=r"^a str was given where a field is needed; give a function from points to distances$"
+    ):
+        check_field("sofas")
+
+
+def test_values_are_equal_by_value_and_fit_on_a_line() -> None:
+    shape = primitives.sphere(0.5)
+    buffers = render(shape, view())
+    assert buffers == render(shape, view())
+    assert buffers != render(shape, view(azimuth=40))
+    assert buffers.occupancy == render(shape, view()).occupancy
+    assert TraceConfig(tolerance=torch.ones(3)) == TraceConfig(tolerance=torch.ones(3))
+    hits = int(buffers.mask.sum())
+    assert repr(buffers) == f"Buffers(float64[24, 24], {hits} of 576 rays hit, radius=1)"
+    assert repr(buffers.trace).startswith(f"Trace(float64[24, 24], {hits} hits, ")
+    assert repr(buffers.rays) == "Rays(origins=float64[24, 24, 3], directions=float64[24, 24, 3])"

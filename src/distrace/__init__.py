@@ -1,40 +1,92 @@
-"""A differentiable renderer for neural signed distance functions, by sphere tracing."""
+"""A differentiable renderer for neural signed distance functions, by sphere tracing.
 
-from distrace import threads as threads  # isort: skip
+>>> import distrace as dt
+>>> model = dt.load_model("sofas")
+>>> camera = dt.Camera.orbit(azimuth=30, elevation=20, distance=4.97, height=64, width=64)
+>>> buffers = dt.render(model.field(0), camera)
+>>> buffers.depth.shape, buffers.normal.shape
+(torch.Size([64, 64]), torch.Size([64, 64, 3]))
+"""
 
-from distrace.boundary import shade as shade
-from distrace.camera import Camera as Camera
-from distrace.checking.gradcheck import GradientCheck as GradientCheck
-from distrace.checking.gradcheck import check_gradients as check_gradients
-from distrace.checking.moves import decoder_changes as decoder_changes
-from distrace.checkpoints.model import Model as Model
-from distrace.checkpoints.model import load_model as load_model
-from distrace.checkpoints.model import save_model as save_model
-from distrace.data.observation import View as View
-from distrace.data.observation import load_view as load_view
-from distrace.fields.base import SDF as SDF
-from distrace.fields.base import chunked as chunked
-from distrace.fields.base import placed as placed
-from distrace.fitting.fit import FitConfig as FitConfig
-from distrace.fitting.fit import fit_shape as fit_shape
-from distrace.fitting.fit_camera import CameraConfig as CameraConfig
-from distrace.fitting.fit_camera import fit_camera as fit_camera
-from distrace.mesh import MeshConfig as MeshConfig
-from distrace.mesh import extract_mesh as extract_mesh
-from distrace.metrics import chamfer as chamfer
-from distrace.prior import prior_of as prior_of
-from distrace.rays import Bounds as Bounds
-from distrace.rays import Rays as Rays
-from distrace.rays import meet_sphere as meet_sphere
-from distrace.render import Buffers as Buffers
-from distrace.render import render as render
-from distrace.surface import attach as attach
-from distrace.surface import clearance as clearance
-from distrace.surface import footprint_normals as footprint_normals
-from distrace.surface import normals as normals
-from distrace.tracing.bounds import Occupancy as Occupancy
-from distrace.tracing.sphere_tracing import Outcome as Outcome
-from distrace.tracing.sphere_tracing import Trace as Trace
-from distrace.tracing.sphere_tracing import TraceConfig as TraceConfig
-from distrace.tracing.sphere_tracing import sphere_trace as sphere_trace
-from distrace.tracing.tracer import TracerConfig as TracerConfig
+from distrace import threads as threads  # isort: skip – it must precede torch
+
+from distrace import losses
+from distrace.boundary import shade
+from distrace.camera import Camera
+from distrace.checking.gradcheck import GradientCheck, check_gradients
+from distrace.checking.moves import decoder_changes
+from distrace.checkpoints.model import Model, load_model, save_model
+from distrace.data.observation import View, load_view
+from distrace.errors import DoubtfulResult
+from distrace.fields import primitives
+from distrace.fields.base import SDF, chunked, placed
+from distrace.fields.batch import BatchField
+from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.fit import FitConfig, fit_shape
+from distrace.fitting.fit_camera import CameraConfig, fit_camera
+from distrace.fitting.fit_code import fit_code
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import Chamfer, chamfer
+from distrace.pose import Similarity, exp_se3, pose_error
+from distrace.prior import Prior, prior_of
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.render import Buffers, render
+from distrace.surface import attach, clearance, footprint_normals, normals
+from distrace.tracing.bounds import Occupancy
+from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig, sphere_trace
+from distrace.tracing.tracer import TracerConfig
+
+__version__ = "0.1.0"  # pyproject.toml reads it here
+
+__all__ = [
+    "SDF",
+    "BatchField",
+    "Bounds",
+    "Buffers",
+    "Camera",
+    "CameraConfig",
+    "Chamfer",
+    "CodeFitConfig",
+    "Decoder",
+    "DoubtfulResult",
+    "FitConfig",
+    "GradientCheck",
+    "MeshConfig",
+    "Model",
+    "NetworkSpecs",
+    "Occupancy",
+    "Outcome",
+    "Prior",
+    "Rays",
+    "Similarity",
+    "Trace",
+    "TraceConfig",
+    "TracerConfig",
+    "View",
+    "attach",
+    "chamfer",
+    "check_gradients",
+    "chunked",
+    "clearance",
+    "decoder_changes",
+    "exp_se3",
+    "extract_mesh",
+    "fit_camera",
+    "fit_code",
+    "fit_shape",
+    "footprint_normals",
+    "load_model",
+    "load_view",
+    "losses",
+    "meet_sphere",
+    "normals",
+    "placed",
+    "pose_error",
+    "primitives",
+    "prior_of",
+    "render",
+    "save_model",
+    "shade",
+    "sphere_trace",
+]

@@ -13,9 +13,12 @@ from distrace.rays import Rays
 from distrace.viewpoint import Number, Point, orbiting, together, upright
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Camera(ByValue):
-    """Intrinsics in pixels and the pose that maps camera to world; both may have batch axes and may require grad."""
+    """A pinhole camera: intrinsics in pixels, and the pose that maps camera to world.
+
+    Both matrices may have batch axes and may require grad. `orbit`, `look_at` and `from_matrices` make one.
+    """
 
     intrinsics: Float[Tensor, "*batch 3 3"]
     T_world_camera: Float[Tensor, "*batch 4 4"]
@@ -24,7 +27,12 @@ class Camera(ByValue):
 
     @staticmethod
     def from_matrices(intrinsics: Tensor, T_world_camera: Tensor, height: int, width: int) -> "Camera":
-        """A camera from its two matrices; raises `ValueError` where they are not a camera's."""
+        """Returns a camera with these matrices. Raises `ValueError` where they are not a camera's.
+
+        >>> intrinsics = torch.tensor([[100.0, 0.0, 16.0], [0.0, 100.0, 16.0], [0.0, 0.0, 1.0]])
+        >>> Camera.from_matrices(intrinsics, torch.eye(4), height=32, width=32).rays().shape
+        torch.Size([32, 32])
+        """
         batch = intrinsics.shape[:-2]
         if intrinsics.shape != (*batch, 3, 3) or T_world_camera.shape != (*batch, 4, 4):
             given = f"{list(intrinsics.shape)} and {list(T_world_camera.shape)}"
@@ -90,7 +98,11 @@ class Camera(ByValue):
         """Returns a camera that looks at the origin from distance · (sin az · cos el, sin el, cos az · cos el).
 
         Angles are in degrees. Tensors keep their gradients; tensors `[*batch]` give a batch of cameras. `dtype` is by
-        default the tensors', of numbers float32. Raises `ValueError` for what is not finite, and as `look_at` does.
+        default the tensors', of numbers float32. Raises `ValueError` for values that are not finite, and as `look_at`.
+
+        >>> camera = Camera.orbit(azimuth=torch.tensor([0.0, 90.0]), elevation=0, distance=3)
+        >>> camera.T_world_camera.shape
+        torch.Size([2, 4, 4])
         """
         eye = orbiting(azimuth, elevation, distance, dtype)
         return Camera.look_at(
@@ -104,21 +116,22 @@ class Camera(ByValue):
         )
 
     def pixels(self) -> Float[Tensor, "height width 2"]:
-        """The centres (x, y) of all pixels."""
+        """Returns the centres (x, y) of all pixels."""
         like = self.intrinsics
         y, x = (torch.arange(0.5, size, dtype=like.dtype, device=like.device) for size in (self.height, self.width))
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
 
     def rays(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Rays:
-        """The rays through pixel positions, by default all centres: [*batch, height, width]."""
+        """Returns the rays through pixel positions, by default all centres: [*batch, height, width]."""
         return self.sight(pixels)[0]
 
     def sight(
         self, pixels: Float[Tensor, "*pixels 2"] | None = None
     ) -> tuple[Rays, Float[Tensor, "*batch_pixels"], Float[Tensor, "*batch_pixels"]]:
-        """`rays`, `cosines` and `pixel_angle` at once."""
+        """Returns `rays`, `cosines` and `pixel_angle` at once."""
         pixels = self.pixels() if pixels is None else pixels
-        batch, axes = self.intrinsics.shape[:-2], (1,) * (pixels.dim() - 1)
+        batch = self.intrinsics.shape[:-2]
+        axes = (1,) * (pixels.dim() - 1)
         rotation = self.T_world_camera[..., :3, :3].reshape(*batch, *axes, 3, 3)
         ahead = self._ahead(pixels)
         depth_one = ahead.norm(dim=-1)
@@ -129,67 +142,70 @@ class Camera(ByValue):
         return Rays(origins, directions), cosines, cosines.square() / focal
 
     def project(self, points_world: Float[Tensor, "*points 3"]) -> tuple[Tensor, Tensor]:
-        """Pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""
-        rotation, centre = self.T_world_camera[:3, :3], self.T_world_camera[:3, 3]
+        """Returns pixel positions [*points, 2] and depths [*points] of points, for a camera without batch axes."""
+        rotation = self.T_world_camera[:3, :3]
+        centre = self.T_world_camera[:3, 3]
         points_camera = (points_world - centre) @ rotation
         image = points_camera @ self.intrinsics.T
         return image[..., :2] / image[..., 2:], points_camera[..., 2]
 
     def shows(self, pixels: Float[Tensor, "*points 2"], depths: Float[Tensor, "*points"]) -> Bool[Tensor, "*points"]:
-        """Which projections lie within the image, and before the camera."""
+        """Returns which projections lie within the image, and before the camera."""
         size = pixels.new_tensor([self.width, self.height])
         return (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
 
     def depth(self, distance: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
-        """Depth z of what lies at a distance along each pixel's ray."""
+        """Returns the depth z of points at a distance along each pixel's ray."""
         return distance * self.cosines()
 
     def cosines(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
-        """Of the angle between each pixel's ray and the optical axis: depth over distance."""
+        """Returns the cosine between each pixel's ray and the optical axis: depth over distance."""
         return 1 / self._ahead(self.pixels() if pixels is None else pixels).norm(dim=-1)
 
     def pixel_angle(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
-        """The width that a pixel covers at a distance of 1: cos²θ / f, θ from the optical axis, f in pixels."""
+        """Returns the width of a pixel at a distance of 1: cos²θ / f, θ from the optical axis, f in pixels."""
         return self.sight(pixels)[2]
 
     def tolerance(self, least_depth: float) -> Float[Tensor, "*batch height width"]:
-        """DIST's convergence criterion: half the distance of what neighbouring pixels see at the least depth.
+        """Returns DIST's convergence criterion: half the distance between neighbouring pixels at the least depth.
 
         ε = d · cos²θ / (2 f), f in pixels (Liu et al., CVPR 2020, section 3.2).
         """
         return least_depth * self.pixel_angle() / 2
 
     def resized(self, factor: float) -> "Camera":
-        """The same camera with a coarser or finer sensor; sizes are rounded up, so that every pixel stays covered.
+        """Returns the same camera with a coarser or finer sensor; sizes are rounded up, so every pixel stays covered.
 
         Raises `ValueError` for a factor that is not positive.
         """
         if not 0 < factor < math.inf:
             raise ValueError(f"a factor of {factor} was given; a sensor is resized by a positive one")
         scale = self.intrinsics.new_tensor([[factor], [factor], [1.0]])
-        size = math.ceil(self.height * factor), math.ceil(self.width * factor)
-        return replace(self, intrinsics=self.intrinsics * scale, height=size[0], width=size[1])
+        height = math.ceil(self.height * factor)
+        width = math.ceil(self.width * factor)
+        return replace(self, intrinsics=self.intrinsics * scale, height=height, width=width)
 
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
-        """The same camera with a part of its sensor. Raises `ValueError` for a part that it does not have."""
+        """Returns the same camera with a part of its sensor. Raises `ValueError` for a part that it does not have."""
         if not (0 <= top < self.height and 0 <= left < self.width and height > 0 and width > 0):
             size = f"{self.height} × {self.width} pixels"
             raise ValueError(f"{height} × {width} pixels from row {top} and column {left} were asked for, of {size}")
-        moved = self.intrinsics.clone()
-        moved[..., 0, 2] -= left
-        moved[..., 1, 2] -= top
-        return replace(
-            self, intrinsics=moved, height=min(height, self.height - top), width=min(width, self.width - left)
-        )
+        intrinsics = self.intrinsics.clone()
+        intrinsics[..., 0, 2] -= left
+        intrinsics[..., 1, 2] -= top
+        height = min(height, self.height - top)
+        width = min(width, self.width - left)
+        return replace(self, intrinsics=intrinsics, height=height, width=width)
 
     def turned(self, degrees: float) -> "Camera":
-        """The camera carried around the world's y axis, anticlockwise from above."""
-        cosine, sine = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+        """Returns the camera rotated about the world's y axis, anticlockwise from above."""
+        cosine = math.cos(math.radians(degrees))
+        sine = math.sin(math.radians(degrees))
         turn = self.T_world_camera.new_tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
         return replace(self, T_world_camera=turn @ self.T_world_camera)
 
     def scaled(self, factor: float) -> "Camera":
-        """The same view of a world whose lengths are × factor."""
+        """Returns the same view of a world whose lengths are × factor."""
         pose = self.T_world_camera.clone()
         pose[..., :3, 3] *= factor
         return replace(self, T_world_camera=pose)
@@ -201,7 +217,7 @@ class Camera(ByValue):
         return replace(self, intrinsics=self.intrinsics.to(device), T_world_camera=self.T_world_camera.to(device))
 
     def _ahead(self, pixels: Tensor) -> Float[Tensor, "*batch_pixels 3"]:
-        """Points at depth 1 seen by pixels, in the camera's axes."""
+        """Returns the points of pixels at depth 1, in the camera's axes."""
         axes = (1,) * (pixels.dim() - 1)
         inverse = torch.linalg.inv(self.intrinsics).reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
         return (inverse * pad(pixels, (0, 1), value=1.0)[..., None, :]).sum(-1)

@@ -2,7 +2,7 @@
 
 import errno
 import re
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -10,12 +10,17 @@ NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
 class DoubtfulResult(UserWarning):
-    """A result that was made, but that is probably not what was meant; one sentence says why."""
+    """Warns of a result that is probably not the one intended; its sentence says why.
+
+    >>> import warnings
+    >>> warnings.simplefilter("error", DoubtfulResult)  # makes it an exception
+    >>> warnings.simplefilter("default", DoubtfulResult)
+    """
 
 
 @contextmanager
-def explained(sentence: str, file: Path | None = None) -> Iterator[None]:
-    """Raises anything that goes wrong inside again as `ValueError(sentence)`, with its cause.
+def explained(sentence: str, file: Path | None = None) -> Generator[None, None, None]:
+    """Raises any error inside again as `ValueError(sentence)`, with its cause.
 
     The cause is what lies in place of `file`, if that is a Git LFS pointer or a web page; else the error's first
     sentence. Ctrl-C and a full disk pass through: no file that is read is to blame for them.
@@ -32,8 +37,8 @@ def explained(sentence: str, file: Path | None = None) -> Iterator[None]:
 
 
 @contextmanager
-def about(subject: object) -> Iterator[None]:
-    """A `ValueError` inside is raised again with what it is about before it."""
+def about(subject: object) -> Generator[None, None, None]:
+    """Raises a `ValueError` inside again, with its subject in front."""
     try:
         yield
     except ValueError as error:

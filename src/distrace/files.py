@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -13,8 +13,9 @@ from torch import Tensor
 
 
 @contextmanager
-def written(path: Path) -> Iterator[BinaryIO]:
-    """A file to write; it takes the name `path` only once all of it is on the disk."""
+def written(path: str | Path) -> Generator[BinaryIO, None, None]:
+    """Opens a file to write; it gets the name `path` once all of it is on the disk."""
+    path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
@@ -28,28 +29,30 @@ def written(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def alone(folder: Path) -> Iterator[None]:
-    """Keeps a folder to one process, for as long as it runs. Raises `ValueError` where another has it."""
+def alone(folder: str | Path) -> Generator[None, None, None]:
+    """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
     try:
-        held = FileLock(folder / ".lock").acquire(blocking=False)
+        held = FileLock(Path(folder) / ".lock").acquire(blocking=False)
     except Timeout:
         raise ValueError(f"another run is writing {folder}; wait for its end, or give another --out") from None
     with held:
         yield
 
 
-def save_text(path: Path, text: str) -> None:
+def save_text(path: str | Path, text: str) -> None:
+    """Writes a text in UTF-8."""
     with written(path) as file:
         file.write(text.encode())
 
 
-def save_json(path: Path, content: Any) -> None:
+def save_json(path: str | Path, content: Any) -> None:
+    """Writes JSON; numbers of other types become floats."""
     with written(path) as file:
         file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
 
 
-def save_arrays(path: Path, arrays: dict[str, Tensor]) -> None:
-    """An `.npz` of tensors."""
+def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
+    """Writes tensors as `.npz`."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
     with written(path) as file:
         np.savez_compressed(file, **content)

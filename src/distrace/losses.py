@@ -1,4 +1,7 @@
-"""What a rendering lacks of an observed view: named terms, pure functions (Liu et al., CVPR 2020, section 3.4)."""
+"""Differences between a rendering and an observed view, as losses (Liu et al., CVPR 2020, section 3.4).
+
+All are scalars, in the units of the world, and keep the gradients of the buffers.
+"""
 
 from dataclasses import dataclass
 
@@ -11,7 +14,7 @@ from distrace.render import Buffers
 
 @dataclass(frozen=True)
 class Weights:
-    """Of the terms in the sum. Depth and normal are DIST's; mask and code: see docs/from_the_paper.md."""
+    """The weights of the terms in a sum. Depth and normal are DIST's; mask and code: see docs/from_the_paper.md."""
 
     depth: float = 10.0
     normal: float = 5.0
@@ -20,26 +23,36 @@ class Weights:
 
 
 def depth_loss(buffers: Buffers, observed: Float[Tensor, "*batch"]) -> Tensor:
-    """Mean |depth − observed| over the rays that hit and have a depth."""
+    """Returns the mean |depth − observed| over the rays that hit and have a finite observed depth.
+
+    >>> from distrace.camera import Camera
+    >>> from distrace.fields import primitives
+    >>> from distrace.render import render
+    >>> camera = Camera.orbit(0, 0, 4, height=16, width=16)
+    >>> observed = render(primitives.sphere(0.5), camera).depth
+    >>> print(f"{depth_loss(render(primitives.sphere(0.49), camera), observed).item():.3f}")
+    0.018
+    """
     both = buffers.mask & torch.isfinite(observed)
     return (buffers.depth[both] - observed[both]).abs().sum() / both.sum().clamp_min(1)
 
 
 def normal_loss(buffers: Buffers, observed: Float[Tensor, "*batch 3"]) -> Tensor:
-    """Mean 1 − n · observed over the rays that hit and have a normal.
+    """Returns the mean 1 − n · observed over the rays that hit and have an observed normal, of unit length.
 
-    n are the footprint normals: exact normals of a ReLU network have no derivative that the loss could descend.
+    n are the footprint normals: exact normals of a ReLU network have no useful derivative.
     """
     both = buffers.mask & (observed.norm(dim=-1) > 0.5)
     return (1 - (buffers.footprint_normal[both] * observed[both]).sum(-1)).sum() / both.sum().clamp_min(1)
 
 
 def silhouette_loss(buffers: Buffers, is_object: Bool[Tensor, "*batch"], tolerance: float) -> tuple[Tensor, Tensor]:
-    """What object rays lack to hit, and background rays to miss: the least f pushed below zero, or above `tolerance`.
+    """Returns two hinge losses on the clearance: of object rays that miss, and of background rays that come too near.
 
-    Both are means over all rays given.
+    Too near is below `tolerance`, a distance in the world. Both are means over all rays.
     """
-    clearance, hit = buffers.clearance, buffers.mask
+    clearance = buffers.clearance
+    hit = buffers.mask
     met = torch.isfinite(clearance)
     missing = clearance[is_object & ~hit & met].clamp_min(0)
     extra = (tolerance - clearance[~is_object & met]).clamp_min(0)

@@ -47,7 +47,7 @@ def filmed(
         yield buffers
 
 
-def save_mp4(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
+def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
     """Writes [frames, height, width, 3] as H.264 that browsers play, each picture for `frame` seconds.
 
     Its sides are even: odd ones get a white row below, a white column on the right. Raises `ValueError` for no picture.
@@ -65,7 +65,7 @@ def save_mp4(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
             movie.mux(stream.encode())
 
 
-def save_gif(path: Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
+def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
     """Writes [frames, height, width, 3] in 256 colours chosen for all of them together; plays for ever.
 
     Pictures that equal the one before become one with it, shown for longer. Raises `ValueError` for no picture.

@@ -1,69 +1,112 @@
-"""Rigid motions of an object before a camera, and how far two of them are apart."""
+"""Rigid motions and similarities: of an object before a camera, and of an object in the world."""
 
 import math
 from dataclasses import dataclass, replace
+from typing import cast
 
 import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from distrace.camera import Camera
+from distrace.equality import ByValue
 from distrace.rays import Rays
 
 
+def exp_se3(
+    rotation_vector: Float[Tensor, "*batch 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Returns the exponential of a twist: the rigid motion that it leads to in unit time, as a matrix.
+
+    `rotation_vector` is the axis times the angle in radians; `translation` is the velocity of the origin, so the origin
+    moves by V · translation (Murray, Li and Sastry, *A Mathematical Introduction to Robotic Manipulation*, 2.3.2). Both
+    keep their gradients, also at zero: optimise them, and move a camera by `exp_se3(r, t) @ camera.T_world_camera`.
+
+    >>> turn = torch.tensor([0.0, torch.pi / 2, 0.0])
+    >>> (exp_se3(turn, torch.zeros(3))[:3, :3] @ torch.tensor([0.0, 0.0, 1.0])).round().tolist()
+    [1.0, 0.0, 0.0]
+    """
+    x, y, z = rotation_vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rotation = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*x.shape, 3, 3)
+    generator = torch.cat([rotation, translation[..., None]], dim=-1)
+    return torch.linalg.matrix_exp(pad(generator, (0, 0, 0, 1)))
+
+
 def object_in_camera(camera: Camera) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
-    """Rotation and translation from the world, whose origin is the object's middle, to the camera."""
+    """Returns rotation and translation from the world, whose origin is the object's centre, to the camera."""
     rotation = camera.T_world_camera[:3, :3].T
     return rotation, -rotation @ camera.T_world_camera[:3, 3]
 
 
 def with_object_at(camera: Camera, rotation: Float[Tensor, "3 3"], translation: Float[Tensor, "3"]) -> Camera:
-    """The same camera where it sees the object so: the inverse of `object_in_camera`."""
+    """Returns the camera with the object at this place before it: the inverse of `object_in_camera`."""
     pose = torch.eye(4, dtype=rotation.dtype, device=rotation.device)
-    pose[:3, :3], pose[:3, 3] = rotation.T, -rotation.T @ translation
+    pose[:3, :3] = rotation.T
+    pose[:3, 3] = -rotation.T @ translation
     return replace(camera, T_world_camera=pose)
 
 
 def turned_object(camera: Camera, rotation_vector: Float[Tensor, "3"], shift: Float[Tensor, "3"]) -> Camera:
-    """The camera that sees the object turned about its middle, by an axis times an angle in the camera's axes, and
-    then shifted."""
+    """Returns the camera with the object rotated about its centre, by a vector in the camera's axes, and then shifted.
+
+    The vector is the axis times the angle in radians.
+    """
     rotation, translation = object_in_camera(camera)
-    turned: Tensor = roma.special_procrustes(roma.rotvec_to_rotmat(rotation_vector) @ rotation)  # pyright: ignore[reportAssignmentType]
-    return with_object_at(camera, turned, translation + shift)  # a rotation to rounding, after many turns, too
+    return with_object_at(camera, _rotated(rotation, rotation_vector), translation + shift)
 
 
 def zoomed(camera: Camera, log_factor: Tensor) -> Camera:
-    """The same camera with another focal length."""
+    """Returns the same camera with its focal lengths × exp(log_factor)."""
     intrinsics = camera.intrinsics.clone()
-    intrinsics[0, 0], intrinsics[1, 1] = (intrinsics[k, k] * log_factor.exp() for k in (0, 1))
+    factor = log_factor.exp()
+    intrinsics[0, 0] = intrinsics[0, 0] * factor
+    intrinsics[1, 1] = intrinsics[1, 1] * factor
     return replace(camera, intrinsics=intrinsics)
 
 
 def aimed(camera: Camera, pixel: Float[Tensor, "2"]) -> Camera:
-    """The camera turned about its own place until the world's origin lies on a pixel's ray, ahead of it."""
+    """Returns the camera rotated in its place so that the world's origin lies on a pixel's ray, ahead of it."""
     rotation, translation = object_in_camera(camera)
-    there = torch.linalg.inv(camera.intrinsics) @ torch.cat([pixel, torch.ones_like(pixel[:1])])
-    distance = translation.norm().clamp_min(1e-6)
-    wanted, now = there / there.norm(), translation / distance
-    axis = torch.linalg.cross(now, wanted)
+    ahead = torch.linalg.inv(camera.intrinsics) @ torch.cat([pixel, torch.ones_like(pixel[:1])])
+    towards_pixel = ahead / ahead.norm()
+    towards_origin = translation / translation.norm().clamp_min(1e-6)
+    axis = torch.linalg.cross(towards_origin, towards_pixel)
     if not axis.norm() > 1e-6:  # straight behind: any axis across serves
-        axis = torch.linalg.cross(now, now.roll(1) + 0.1)
-    angle = torch.acos((now @ wanted).clamp(-1, 1))
+        axis = torch.linalg.cross(towards_origin, towards_origin.roll(1) + 0.1)
+    angle = torch.acos((towards_origin @ towards_pixel).clamp(-1, 1))
     turn = roma.rotvec_to_rotmat(axis / axis.norm() * angle)
     return with_object_at(camera, turn @ rotation, turn @ translation)
 
 
 def pose_error(camera: Camera, truth: Camera) -> tuple[float, float]:
-    """Degrees between two orientations, and the object's shift before the camera in percent of its true distance."""
-    (rotation, translation), (true, there) = (object_in_camera(which) for which in (camera, truth))
-    degrees = math.degrees(float(roma.rotmat_geodesic_distance(rotation.double(), true.double())))
-    return degrees, 100 * float((translation - there).norm() / there.norm())
+    """Returns the degrees between two orientations, and the shift of the object in percent of its true distance.
+
+    >>> degrees, percent = pose_error(Camera.orbit(0, 0, 4.4), Camera.orbit(0, 0, 4))
+    >>> round(degrees), round(percent)
+    (0, 10)
+    """
+    rotation, translation = object_in_camera(camera)
+    true_rotation, true_translation = object_in_camera(truth)
+    degrees = math.degrees(float(roma.rotmat_geodesic_distance(rotation.double(), true_rotation.double())))
+    return degrees, 100 * float((translation - true_translation).norm() / true_translation.norm())
 
 
-@dataclass(frozen=True)
-class Similarity:
-    """Where an object lies in the world: x_world = scale · rotation · x_object + translation."""
+def _rotated(rotation: Float[Tensor, "3 3"], rotation_vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """Returns a rotation followed by another one, orthogonal to rounding also after many calls."""
+    product = roma.rotvec_to_rotmat(rotation_vector) @ rotation
+    return cast(Tensor, roma.special_procrustes(product))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Similarity(ByValue):
+    """The placement of an object in the world: x_world = scale · rotation · x_object + translation.
+
+    >>> Similarity.identity().to_world(torch.ones(2, 3)).shape
+    torch.Size([2, 3])
+    """
 
     rotation: Float[Tensor, "3 3"]
     translation: Float[Tensor, "3"]
@@ -78,47 +121,54 @@ class Similarity:
 
     @property
     def T_world_object(self) -> Float[Tensor, "4 4"]:
+        """The matrix of the similarity, as `placed` takes it."""
         matrix = torch.eye(4).to(self.rotation)
-        matrix[:3, :3], matrix[:3, 3] = self.scale * self.rotation, self.translation
+        matrix[:3, :3] = self.scale * self.rotation
+        matrix[:3, 3] = self.translation
         return matrix
 
     def to_world(self, points_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Returns points of the object in the world."""
         return self.scale * self.turned(points_object) + self.translation
 
     def to_object(self, points_world: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
+        """Returns points of the world in the object's frame."""
         return (points_world - self.translation) @ self.rotation / self.scale
 
     def turned(self, vectors_object: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3"]:
-        """Directions of the object, in the world."""
+        """Returns directions of the object in the world."""
         return vectors_object @ self.rotation.T
 
     def rays_in_object(self, rays: Rays) -> Rays:
-        """Rays of the world as the object has them; distances along them are divided by the scale."""
+        """Returns rays of the world in the object's frame; distances along them are divided by the scale."""
         return Rays(self.to_object(rays.origins), rays.directions @ self.rotation)
 
     def camera_in_object(self, camera: Camera) -> Camera:
-        """The camera that sees the object in its own frame as the given one does in the world; depths are divided."""
+        """Returns the camera with the same view in the object's frame; depths are divided by the scale."""
         pose = camera.T_world_camera.clone()
         pose[:3, :3] = self.rotation.T @ pose[:3, :3]
         pose[:3, 3] = self.to_object(pose[:3, 3])
         return replace(camera, T_world_camera=pose)
 
     def moved(self, step: Float[Tensor, "7"]) -> "Similarity":
-        """Turned about the object's middle by an axis times an angle, shifted, in the world's axes, and grown by e to
-        the last."""
-        turned: Tensor = roma.special_procrustes(roma.rotvec_to_rotmat(step[:3]) @ self.rotation)  # pyright: ignore[reportAssignmentType]
-        return Similarity(turned, self.translation + step[3:6], self.scale * step[6].exp())
+        """Returns the placement after a step: rotation vector (3), shift (3) and log scale, in the world's axes.
+
+        The rotation is about the object's centre.
+        """
+        rotation = _rotated(self.rotation, step[:3])
+        return Similarity(rotation, self.translation + step[3:6], self.scale * step[6].exp())
 
     def step_from(self, other: "Similarity") -> Float[Tensor, "7"]:
-        """By which the other would be moved here."""
-        turn: Tensor = roma.rotmat_to_rotvec(self.rotation @ other.rotation.T)  # pyright: ignore[reportAssignmentType]
+        """Returns the step by which `other.moved(step)` is this placement."""
+        turn = cast(Tensor, roma.rotmat_to_rotvec(self.rotation @ other.rotation.T))
         return torch.cat([turn, self.translation - other.translation, (self.scale / other.scale).log()[None]])
 
     def change(self, points_object: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 7"]:
-        """By which the object's field, whose gradient there is given, changes at fixed points of the world as it moves.
+        """Returns the derivatives of the object's field at fixed points of the world by the step of `moved`.
 
-        In the object's frame those points move the other way: x → x − (ω × x + τ / scale + σ x).
+        `gradient` is that of the field at the points. In the object's frame the points move the other way:
+        x → x − (ω × x + τ / scale + σ x).
         """
-        turning = torch.linalg.cross(points_object, gradient) @ self.rotation.T
-        growing = (points_object * gradient).sum(-1, keepdim=True)
-        return -torch.cat([turning, self.turned(gradient) / self.scale, growing], dim=1)
+        by_rotation = torch.linalg.cross(points_object, gradient) @ self.rotation.T
+        by_scale = (points_object * gradient).sum(-1, keepdim=True)
+        return -torch.cat([by_rotation, self.turned(gradient) / self.scale, by_scale], dim=1)

@@ -1,8 +1,8 @@
-"""Work that is done in several processes at once."""
+"""Tasks in parallel processes."""
 
 import os
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
@@ -15,14 +15,14 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def each_done(work: Callable[[Task], Result], wanted: Sequence[Task], jobs: int) -> Iterator[Result]:
-    """The result of each task, as it is done; in so many processes of one thread each.
+def each_done(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
+    """Yields the result of each task as it completes, from `jobs` processes of one thread each.
 
-    Where the caller stops, by Ctrl-C or otherwise, they are ended: what they write must be whole or absent.
+    If the caller stops, by Ctrl-C or otherwise, the processes are terminated: their files must be whole or absent.
     """
     pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin)
     with _deaf_children():
-        pending = [pool.submit(work, task) for task in wanted]
+        pending = [pool.submit(work, task) for task in tasks]
     workers = list((pool._processes or {}).values())  # a public way to end them comes with Python 3.14
     try:
         for done in as_completed(pending):
@@ -36,13 +36,13 @@ def each_done(work: Callable[[Task], Result], wanted: Sequence[Task], jobs: int)
 
 
 def _begin() -> None:
-    """In a process of its own: one thread for the work, and one that waits for the end of who began it."""
+    """Sets up a process: one thread for the work, and one that waits for the parent's end."""
     torch.set_num_threads(1)
     Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A caller that is killed ends nobody: without this, its processes would wait for work for ever."""
+    """Exits with the parent: if that is killed, its processes would wait for work for ever."""
     parent = parent_process()
     if parent is not None:
         parent.join()
@@ -50,9 +50,9 @@ def _end_with_parent() -> None:
 
 
 @contextmanager
-def _deaf_children() -> Iterator[None]:
-    """Processes that begin here do not hear Ctrl-C, which a terminal sends to all of them: who began them does."""
-    if current_thread() is not main_thread():  # which alone hears signals
+def _deaf_children() -> Generator[None, None, None]:
+    """Starts processes that ignore Ctrl-C, which a terminal sends to all of them: the parent handles it."""
+    if current_thread() is not main_thread():  # only the main thread may set signal handlers
         yield
         return
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)

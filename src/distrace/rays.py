@@ -1,6 +1,7 @@
-"""Rays, and where they meet the bounds of a field."""
+"""Rays, and the interval of each within the bounds of a field."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Float
@@ -9,9 +10,14 @@ from torch import Tensor
 from distrace.equality import ByValue
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Rays(ByValue):
-    """Half lines origin + t · direction; directions have unit length, so t is a distance."""
+    """Half lines origin + t · direction; directions have unit length, so t is a distance.
+
+    >>> rays = Rays(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[0.0, 0.0, -1.0]]))
+    >>> rays.at(torch.tensor([1.5]))
+    tensor([[0.0000, 0.0000, 0.5000]])
+    """
 
     origins: Float[Tensor, "*batch 3"]
     directions: Float[Tensor, "*batch 3"]
@@ -21,9 +27,10 @@ class Rays(ByValue):
         return self.directions.shape[:-1]
 
     def at(self, distance: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch 3"]:
+        """Returns the points at distances along the rays."""
         return self.origins + distance[..., None] * self.directions
 
-    def __getitem__(self, index: Tensor | tuple | int) -> "Rays":
+    def __getitem__(self, index: Tensor | tuple[Any, ...] | int) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
 
     def flat(self) -> "Rays":
@@ -33,9 +40,9 @@ class Rays(ByValue):
         return Rays(self.origins.detach(), self.directions.detach())
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Bounds(ByValue):
-    """The stretch of each ray that is looked at; empty (near > far) where the ray misses what bounds the field."""
+    """The interval of each ray to trace; empty (near > far) where the ray misses what bounds the field."""
 
     near: Float[Tensor, "*batch"]
     far: Float[Tensor, "*batch"]
@@ -46,17 +53,22 @@ class Bounds(ByValue):
 
 
 def meet_sphere(rays: Rays, radius: float = 1.0) -> Bounds:
-    """Where rays are within a sphere around the origin: |o + t v| ≤ radius, t ≥ 0."""
+    """Returns the interval of each ray within a sphere around the origin: |o + t v| ≤ radius, t ≥ 0.
+
+    >>> meet_sphere(Rays(torch.tensor([0.0, 0.0, 3.0]), torch.tensor([0.0, 0.0, -1.0])))
+    Bounds(near=2, far=4)
+    """
     towards = -(rays.origins * rays.directions).sum(-1)
     nearest = (rays.origins + towards[..., None] * rays.directions).square().sum(-1)  # no cancellation from far away
     half = (radius**2 - nearest).clamp_min(0).sqrt()
-    near, far = (towards - half).clamp_min(0), towards + half
+    near = (towards - half).clamp_min(0)
+    far = towards + half
     misses = (nearest >= radius**2) | (far <= 0)
     return Bounds(near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf))
 
 
 def meet_box(rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bounds:
-    """Where rays are within a box with sides along the axes, t ≥ 0."""
+    """Returns the interval of each ray within a box with sides along the axes, t ≥ 0."""
     sides = torch.stack([(side - rays.origins) / rays.directions for side in (low, high)])
     near = sides.amin(0).nan_to_num(-torch.inf, posinf=torch.inf, neginf=-torch.inf).amax(-1).clamp_min(0)
     far = sides.amax(0).nan_to_num(torch.inf, posinf=torch.inf, neginf=-torch.inf).amin(-1)

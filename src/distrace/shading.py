@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from matplotlib import colormaps
-from PIL import Image, ImageDraw
 from torch import Tensor
 
 from distrace.files import written
@@ -31,7 +29,7 @@ def depth_picture(depth: Float[Array, "height width"], near: float | None = None
     least, most = depth_range(values)
     near, far = least if near is None else near, most if far is None else far
     nearness = (far - np.where(seen, values, far)) / max(far - near, 1e-12)
-    return _over_white(colormaps["viridis"](nearness)[..., :3], seen)
+    return _over_white(_mapped("viridis", nearness), seen)
 
 
 def depth_range(*depths: Float[Array, "..."]) -> tuple[float, float]:
@@ -93,13 +91,15 @@ def error_picture(difference: Float[Array, "height width"], limit: float) -> Pic
     """A signed difference: blue is -limit, red is +limit, grey is none, white is where there is nothing to compare."""
     values = _numpy(difference)
     seen = np.isfinite(values)
-    return _over_white(colormaps["coolwarm"](np.where(seen, values, 0) / (2 * limit) + 0.5)[..., :3], seen)
+    return _over_white(_mapped("coolwarm", np.where(seen, values, 0) / (2 * limit) + 0.5), seen)
 
 
 def dots_picture(
     base: Picture, depth: Float[Array, "height width"], near: float | None = None, far: float | None = None
 ) -> Picture:
     """A faded picture of the same size, enlarged, and on it every pixel with a depth as a dot in the depth's colour."""
+    from PIL import Image, ImageDraw
+
     scale = max(1, -(-600 // base.shape[1]))
     faded = Image.fromarray(255 - (255 - base) // 3).resize((base.shape[1] * scale, base.shape[0] * scale))
     canvas = faded.resize((2 * faded.width, 2 * faded.height))  # drawn at twice the size: PIL's edges are hard
@@ -136,7 +136,10 @@ def grid(rows: Sequence[Sequence[Picture]], gap: int = 8) -> Picture:
     return canvas
 
 
-def save_png(path: Path, picture: Picture) -> None:
+def save_png(path: str | Path, picture: Picture) -> None:
+    """Writes a picture as PNG; the folder is made if it is missing."""
+    from PIL import Image
+
     with written(path) as file:
         Image.fromarray(picture).save(file, format="PNG", optimize=True)
 
@@ -147,6 +150,13 @@ def _key_light(towards: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray
     up = np.array([0.0, 1.0, 0.0] if abs(back[1]) < 0.999 else [0.0, 0.0, 1.0])
     right = _unit(np.cross(up, back))
     return _unit(0.6 * back - 0.65 * right + 0.75 * np.cross(back, right))
+
+
+def _mapped(name: str, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 3"]:
+    """Returns the colours of values from 0 to 1 by one of matplotlib's colour maps."""
+    from matplotlib import colormaps  # a fifth of a second, for pictures alone
+
+    return colormaps[name](values)[..., :3]
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -3,9 +3,9 @@
 This module is imported before torch, whose OpenMP library reads the first when it loads. A script that imports torch
 before distrace sets `GOMP_SPINCOUNT=20000` in its environment.
 
-GNU's default, 300,000 rounds, is for threads that have a core each. On two busy cores the threads that spin keep the
-others from running: a view took 10.6 s instead of 6.4 s, the demo 300 s instead of 80 s. On idle cores 20,000 rounds
-cost nothing that could be measured, 2,000 a tenth.
+GNU's default, 300,000 rounds, suits threads that have a core each. On busy cores, spinning threads block the ones they
+wait for: a view took 10.6 s instead of 6.4 s on two cores, the demo 300 s instead of 80 s. On idle cores 20,000 rounds
+cost nothing measurable; 2,000 cost 10 %.
 """
 
 import os

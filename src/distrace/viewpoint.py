@@ -1,4 +1,4 @@
-"""Where cameras stand and how they are turned, from numbers or from tensors with gradients and batch axes."""
+"""Positions and orientations of cameras, from numbers or from tensors with gradients and batch axes."""
 
 import math
 from collections.abc import Sequence
@@ -21,13 +21,14 @@ def orbiting(
     """Returns distance · (sin az · cos el, sin el, cos az · cos el) for angles in degrees.
 
     Tensors keep their gradients and are broadcast. `dtype` is by default that of the tensors, of numbers float32.
-    Raises `ValueError` for what is not finite, and for tensors whose shapes do not fit.
+    Raises `ValueError` for values that are not finite, and for tensors whose shapes do not fit.
     """
     if isinstance(azimuth, Tensor) or isinstance(elevation, Tensor) or isinstance(distance, Tensor):
         return _of_tensors(azimuth, elevation, distance, dtype)
     if not all(map(math.isfinite, (azimuth, elevation, distance))):
         raise ValueError(_infinite(azimuth, elevation, distance))
-    az, el = math.radians(azimuth), math.radians(elevation)
+    az = math.radians(azimuth)
+    el = math.radians(elevation)
     eye = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
     return torch.tensor(eye, dtype=dtype or torch.float32) * distance
 
@@ -59,12 +60,14 @@ def _of_tensors(
     azimuth: Number, elevation: Number, distance: Number, dtype: torch.dtype | None
 ) -> Float[Tensor, "*batch 3"]:
     given = [part for part in (azimuth, elevation, distance) if isinstance(part, Tensor)]
-    dtype, device = dtype or _precision(given), given[0].device
+    dtype = dtype or _precision(given)
+    device = given[0].device
     parts = [torch.as_tensor(part, dtype=dtype, device=device) for part in (azimuth, elevation, distance)]
     az, el, away = _broadcast("azimuth, elevation and distance", *parts)
     if not (az.isfinite() & el.isfinite() & away.isfinite()).all():
         raise ValueError(_infinite(*(part.tolist() for part in parts)))
-    az, el = torch.deg2rad(az), torch.deg2rad(el)
+    az = torch.deg2rad(az)
+    el = torch.deg2rad(el)
     unit = torch.stack([az.sin() * el.cos(), el.sin(), az.cos() * el.cos()], dim=-1)
     return unit * away[..., None]
 

@@ -7,8 +7,10 @@ A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParam
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from difflib import get_close_matches
 from importlib.resources import files
 from pathlib import Path
+from typing import overload
 
 import numpy as np
 import safetensors.torch
@@ -17,29 +19,42 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
+from distrace.equality import ByValue, summary
 from distrace.errors import explained
-from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
-from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.files import written
 
 BUNDLED = Path(str(files("distrace"))) / "models"
-VARIANT = "~"  # in the name of a shape that another was mirrored or warped to
+VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
 
 
-@dataclass(frozen=True)
-class Model:
-    """A trained decoder and the codes of the shapes it was trained on. Weights are frozen: `requires_grad_()` thaws."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Model(ByValue):
+    """A trained decoder, and the codes [shapes, length] of the shapes that it was trained on.
+
+    `load_model` returns one. Weights are frozen; `model.decoder.requires_grad_()` unfreezes them.
+    """
 
     name: str
     decoder: Decoder
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
-        """The signed distance field of a training code, or of any code; from codes [B, length] that of B shapes.
+    @overload
+    def field(self, code: int) -> ShapeField: ...
+
+    @overload
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]: ...
+
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
+        """Returns the signed distance field of a training code, of any code, or of B shapes from codes [B, length].
 
         Raises `ValueError` for a number or a length that the model has not.
+
+        >>> model = load_model("sofas")
+        >>> model.field(0)(torch.zeros(5, 3)).shape
+        torch.Size([5])
         """
         if isinstance(code, Tensor | np.ndarray):
             return self.decoder.field(code)
@@ -47,34 +62,45 @@ class Model:
             raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])
 
+    def __repr__(self) -> str:
+        codes = summary(self.codes)
+        return f"Model({self.name!r}, {len(self.shapes)} shapes, codes={codes}, {self.decoder.specs.size})"
+
     def code_of(self, shape: str) -> Float[Tensor, "length"]:
-        """Of a shape that it was trained on, by name."""
+        """Returns the code of a training shape. Raises `ValueError` for a name that the model has not."""
+        if shape not in self.shapes:
+            close = get_close_matches(shape, self.shapes, cutoff=0.4)
+            proposal = f"did you mean {' or '.join(close)}?" if close else "see `model.shapes`"
+            raise ValueError(f"{self.name} has no shape {shape!r}; {proposal}")
         return self.codes[self.shapes.index(shape)]
 
-    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "some length"]:
-        """By name; of variants that it was not trained on their original's, of other shapes the mean code."""
-        known = dict(zip(self.shapes, self.codes, strict=True))
+    def codes_of(self, shapes: Sequence[str]) -> Float[Tensor, "n length"]:
+        """Returns codes by name: of an unknown variant its original's, of other unknown shapes the mean code."""
+        code_of = dict(zip(self.shapes, self.codes, strict=True))
         mean = self.codes.sum(0) / max(len(self.codes), 1)
-        return torch.stack([known.get(shape, known.get(original(shape), mean)) for shape in shapes])
+        return torch.stack([code_of.get(shape, code_of.get(original(shape), mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
         return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
 
 
 def original(shape: str) -> str:
-    """The name of what a variant was made of; of other shapes their own."""
+    """Returns the name of the shape that a variant was made from; of other shapes their own."""
     return shape.split(VARIANT)[0]
 
 
 def bundled_models() -> list[str]:
-    """The names that `load_model` knows without a folder."""
+    """Returns the names of the bundled models."""
     return sorted(path.parent.name for path in BUNDLED.glob("*/specs.json"))
 
 
 def load_model(name: str | Path) -> Model:
-    """A bundled model by name, or any DeepSDF experiment folder.
+    """Loads a bundled model by name, or any DeepSDF experiment folder.
 
     Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
+
+    >>> load_model("sofas")
+    Model('sofas', 657 shapes, codes=float32[657, 256], 8 × 512)
     """
     folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
     if not folder.is_dir():
@@ -93,8 +119,12 @@ def load_model(name: str | Path) -> Model:
     return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
 
 
-def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
-    """Writes our own, smaller form into a folder: weight norm multiplied out, in half precision."""
+def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
+    """Writes a model into a folder, in distrace's own, smaller form: weight norm multiplied out, in half precision.
+
+    `load_model(folder)` reads it.
+    """
+    folder = Path(folder)
     specs = model.decoder.specs
     plain = replace(specs, norm_layers=(), weight_norm=False) if specs.weight_norm else specs
     tensors = {key: value for key, value in model.decoder.state_dict().items() if "parametrizations" not in key}
@@ -106,8 +136,9 @@ def save_model(folder: Path, model: Model, dtype: torch.dtype = torch.float16) -
         file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
 
 
-def save_experiment(folder: Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
+def save_experiment(folder: str | Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
     """Writes DeepSDF's own layout, with the key names that its original code reads."""
+    folder = Path(folder)
     _write_specs(folder, decoder.specs, shapes)
     write_weights(folder, decoder, codes)
 
@@ -165,15 +196,15 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
 
 def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
     if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
-        given = list(codes.shape)
-        wanted = f"[n, {specs.code_length}]"
-        raise ValueError(f"{folder} has codes of shape {given}, but specs.json asks for {wanted}")
+        raise ValueError(
+            f"{folder} has codes of shape {list(codes.shape)}, but specs.json asks for [n, {specs.code_length}]"
+        )
     if not codes.isfinite().all():
         raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
 
 
 def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
-    """The decoder with the weights put in, after a look at each: their names, shapes and values."""
+    """Returns the decoder with the weights, whose names, shapes and values are checked."""
     expected = decoder.state_dict()
     for key in sorted(expected.keys() | state.keys()):
         if key not in state:
@@ -181,9 +212,8 @@ def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder
         if key not in expected:
             raise ValueError(f"{source} has {key}, for which specs.json has no place")
         if state[key].shape != expected[key].shape:
-            given = list(state[key].shape)
-            wanted = list(expected[key].shape)
-            raise ValueError(f"{source}: {key} has shape {given}, but specs.json asks for {wanted}")
+            shapes = f"has shape {list(state[key].shape)}, but specs.json asks for {list(expected[key].shape)}"
+            raise ValueError(f"{source}: {key} {shapes}")
         if state[key].layout != torch.strided:
             raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")
         if not state[key].isfinite().all():

@@ -11,21 +11,22 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 from torch.nn.utils.parametrizations import weight_norm
 
+from distrace.equality import summary
 from distrace.fields.base import SDF, flattened, in_chunks
 from distrace.fields.batch import BatchField
-from distrace.fields.products import Layer, Product, evaluated, joined, linear
+from distrace.fields.products import Layer, Product, evaluate_layers, joined, linear
 
-QUIET = 0.5  # a unit is off if it stays so many standard deviations below zero
-ROUND = 16  # widths that processors like
-SAMPLED = 8  # deviations are measured at every so many points
-CHUNK = 1 << 20  # points evaluated at a time without derivatives, and with …
-RECORDED_CHUNK = 4096  # … on a CPU: a layer's fresh activations then stay in the cache
-FAR = 0.1  # DeepSDF clamps what it learns from here: decoders say no more of distances beyond
+OFF_MARGIN = 0.5  # standard deviations below zero at which a unit counts as off
+WIDTH_MULTIPLE = 16  # of pruned layers: processors multiply such matrices faster
+SAMPLE_STRIDE = 8  # deviations are measured at every so many points
+CHUNK = 1 << 20  # points evaluated at a time without derivatives
+RECORDED_CHUNK = 4096  # … and with them on a CPU: a layer's fresh activations then stay in the cache
+FAR = 0.1  # the distance at which DeepSDF clamps its samples: decoders are not trained on larger ones
 
 
 @dataclass(frozen=True)
 class NetworkSpecs:
-    """The architecture, with the keys of `NetworkSpecs` in DeepSDF's `specs.json`."""
+    """A decoder's architecture, with the keys of `NetworkSpecs` in DeepSDF's `specs.json`."""
 
     dims: tuple[int, ...] = (512,) * 8
     code_length: int = 256
@@ -37,11 +38,21 @@ class NetworkSpecs:
     dropout: tuple[int, ...] = ()
     dropout_prob: float = 0.0
 
+    @property
+    def size(self) -> str:
+        """Returns the hidden layers in words: `8 × 512`, or their widths one by one."""
+        widths = set(self.dims)
+        return f"{len(self.dims)} × {widths.pop()}" if len(widths) == 1 else "-".join(map(str, self.dims))
+
 
 class Decoder(nn.Module):
-    """f(point; code): ReLU layers `lin0 … linN`, the input fed again at the layers `latent_in`, tanh at the end.
+    """The DeepSDF network f(point; code): ReLU layers `lin0 … linN`, and tanh at the end.
 
-    Raises `ValueError` for layers without room for what is fed again.
+    The input enters again at the layers `latent_in`. Raises `ValueError` for layers without room for it.
+
+    >>> decoder = Decoder(NetworkSpecs(dims=(32, 32), code_length=4, latent_in=(), norm_layers=()))
+    >>> decoder(torch.zeros(5, 3), torch.zeros(4)).shape
+    torch.Size([5])
     """
 
     def __init__(self, specs: NetworkSpecs = NetworkSpecs()) -> None:
@@ -51,7 +62,7 @@ class Decoder(nn.Module):
         outputs = [self._outputs(widths, layer) for layer in range(self.depth)]
         if specs.code_length < 1 or min(outputs) < 1:
             given = f"a code of {specs.code_length} and layers of {outputs} outputs"
-            raise ValueError(f"{given} were asked for, what is fed again set apart; each must be at least 1")
+            raise ValueError(f"{given} were given, without the inputs that are fed again; each must be at least 1")
         for layer in range(self.depth):
             linear = nn.Linear(widths[layer], outputs[layer])
             normed = layer in specs.norm_layers
@@ -68,7 +79,7 @@ class Decoder(nn.Module):
         return bool(self.specs.norm_layers) and not self.specs.weight_norm
 
     def is_fed(self, layer: int) -> bool:
-        """Whether points enter a layer, with or without the code."""
+        """Returns whether points enter a layer, with or without the code."""
         return layer == 0 or layer in self.specs.latent_in or self.specs.xyz_in_all
 
     def _outputs(self, widths: list[int], layer: int) -> int:
@@ -80,25 +91,23 @@ class Decoder(nn.Module):
     def forward(
         self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]
     ) -> Float[Tensor, "*batch"]:
-        """Values in (-1, 1). A code with batch axes of size 1 enters the first layer once, not per point.
+        """Returns values in (-1, 1). A code with batch axes of size 1 enters the first layer once, not per point.
 
         Under autocast points and code keep their precision: in bfloat16 a point at 0.8 would be off by up to 0.002.
         """
-        with torch.autocast(points.device.type, enabled=False):
-            layers = self.folded(code)
-        return self._run(layers, points)
+        return self._run(self.folded(code), points)
 
     def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField[ShapeField]":
-        """The signed distance field of one shape or, from codes [B, length], the field of B shapes.
+        """Returns the signed distance field of one shape or, from codes [B, length], the field of B shapes.
 
-        Constant codes are folded into the biases of the layers they enter. In the decoder's precision, whatever the
-        codes'. Raises `ValueError` for a code of another length.
+        The code is folded into the biases of the layers that it enters, and keeps its gradient. The field has the
+        decoder's precision. Raises `ValueError` for a code of another length.
         """
         code = self.checked(code)
         return self.fields(code) if code.dim() == 2 else self._single(code)
 
     def fields(self, codes: Float[Tensor | np.ndarray, "shapes length"]) -> "BatchField[ShapeField]":
-        """The field of several shapes, as `field` gives it."""
+        """Returns the field of several shapes."""
         codes = self.checked(codes)
         return BatchField(codes, Evaluation(self, self.folded(codes)), self._single)
 
@@ -106,22 +115,29 @@ class Decoder(nn.Module):
         return ShapeField(self, self.folded(code), code)
 
     def checked(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> Float[Tensor, "*shapes length"]:
-        """A code, or several, in the decoder's precision and on its device. Raises `ValueError` for another length."""
-        code, length = torch.as_tensor(code).to(next(self.parameters())), self.specs.code_length
+        """Returns codes in the decoder's precision and on its device. Raises `ValueError` for another length."""
+        code = torch.as_tensor(code).to(next(self.parameters()))
+        length = self.specs.code_length
         if code.dim() not in (1, 2) or code.shape[-1] != length:
             takes = f"[shapes, {length}]" if code.dim() == 2 else [length]
             raise ValueError(f"a code of shape {list(code.shape)} was given; this decoder takes {takes}")
         return code
 
     def folded(self, code: Float[Tensor, "*batch length"]) -> list[Layer]:
-        """Each layer's weight without the code's columns, and its bias with what the code adds: [*batch, outputs]."""
-        layers, length = [], self.specs.code_length
+        """Returns each layer's weight without the code's columns, and its bias with the code's part [*batch, outputs].
+
+        Both keep their precision under autocast.
+        """
+        layers: list[Layer] = []
+        length = self.specs.code_length
         for layer in range(self.depth):
-            linear = getattr(self, f"lin{layer}")
-            weight, bias = linear.weight, linear.bias
+            linear: nn.Linear = getattr(self, f"lin{layer}")
+            weight = linear.weight
+            bias = linear.bias
             if layer == 0 or layer in self.specs.latent_in:
                 start = weight.shape[1] - length - 3
-                bias = F.linear(code, weight[:, start : start + length], bias)
+                with torch.autocast(code.device.type, enabled=False):
+                    bias = F.linear(code, weight[:, start : start + length], bias)
                 weight = torch.cat([weight[:, :start], weight[:, start + length :]], dim=1)
             layers.append((weight, bias))
         return layers
@@ -134,10 +150,10 @@ class Decoder(nn.Module):
                 if watch:
                     watch(layer, x)
                 x = self._activated(x, layer)
-        return self.ended(x[..., 0])
+        return self.output(x[..., 0])
 
-    def ended(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        """The last layer's outputs, bent by tanh."""
+    def output(self, x: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+        """Returns the values of the last layer's outputs: their tanh."""
         return torch.tanh(torch.tanh(x) if self.specs.use_tanh else x)
 
     def _activated(self, x: Tensor, layer: int) -> Tensor:
@@ -149,14 +165,18 @@ class Decoder(nn.Module):
 
 
 class Evaluation:
-    """Values at points, by layers that one code is folded into, or several: then `shape` numbers each point's shape."""
+    """Evaluates layers that one code is folded into, or several: then `shape` numbers each point's shape."""
 
     def __init__(self, decoder: Decoder, layers: list[Layer]) -> None:
-        self.decoder, self.layers = decoder, layers
+        self.decoder = decoder
+        self.layers = layers
         self.products = [Product.of(layer, decoder.is_fed(number)) for number, layer in enumerate(layers)]
 
     def __call__(self, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None = None) -> Float[Tensor, "n"]:
-        """Raises `ValueError` for points of another precision than the decoder's."""
+        """Returns values at points; they keep their precision under autocast.
+
+        Raises `ValueError` for points of another precision than the decoder's.
+        """
         weight = self.layers[0][0]
         if points.dtype != weight.dtype:
             raise ValueError(
@@ -167,30 +187,40 @@ class Evaluation:
         quick = on_cpu and not torch.is_grad_enabled() and not self.decoder.has_layer_norms
         quick = quick and not self.decoder.training and not torch._C._are_functorch_transforms_active()
         size = RECORDED_CHUNK if on_cpu and not quick else CHUNK
-        return in_chunks(self._quick if quick else self._recorded, size, points, *([] if shape is None else [shape]))
+        rows = (points,) if shape is None else (points, shape)
+        with torch.autocast(points.device.type, enabled=False):  # in bfloat16 surfaces would be off by 1e-3
+            return in_chunks(self._quick if quick else self._recorded, size, *rows)
 
     def _quick(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
-        return self.decoder.ended(evaluated(self.products, points, shape))
+        return self.decoder.output(evaluate_layers(self.products, points, shape))
 
     def _recorded(self, points: Tensor, shape: Tensor | None = None) -> Tensor:
-        """By operations that autograd, autocast and `torch.func` see through."""
+        """By operations that autograd and `torch.func` see through."""
         layers = self.layers if shape is None else [(w, b if b.dim() == 1 else b[shape]) for w, b in self.layers]
         return self.decoder._run(layers, points)
 
 
 class ShapeField:
-    """The field of one shape: a decoder whose layers have the shape's code folded in, if it is known which."""
+    """The signed distance field of one shape, as `model.field(code)` returns it: a decoder with the code folded in.
+
+    Call it with points [*batch, 3] for distances [*batch], in the model's units. `code` is None once it is pruned.
+    """
 
     def __init__(self, decoder: Decoder, layers: list[Layer], code: Float[Tensor, "length"] | None = None) -> None:
-        self.decoder, self.layers, self.code = decoder, layers, code
+        self.decoder = decoder
+        self.layers = layers
+        self.code = code
         self.evaluate = Evaluation(decoder, layers)
+
+    def __repr__(self) -> str:
+        return f"ShapeField({self.decoder.specs.size}, code={summary(self.code)})"
 
     def __call__(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch"]:
         return flattened(self.evaluate, points)
 
     @torch.no_grad()
-    def narrowed(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
-        """Values at points, and the same field without the ReLU units that are off, by a margin, at all of them.
+    def pruned(self, points: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "n"], SDF]:
+        """Returns values at points, and the field without the ReLU units that are off at all of them, by a margin.
 
         Around the points it has the same values to rounding, at half the cost for an 8 × 512 decoder near its surface.
         """
@@ -202,24 +232,24 @@ class ShapeField:
 
         def watch(layer: int, x: Tensor) -> None:
             highest[layer] = highest[layer].maximum(x.amax(0))
-            deviation[layer] = deviation[layer].maximum(x[::SAMPLED].std(0, correction=0))
+            deviation[layer] = deviation[layer].maximum(x[::SAMPLE_STRIDE].std(0, correction=0))
 
         values = in_chunks(partial(self.decoder._run, self.layers, watch=watch), RECORDED_CHUNK, points)
-        kept = [_on(*both) for both in zip(highest, deviation, strict=True)]
-        with torch.enable_grad():  # what surfaces are attached to is as differentiable as the whole
-            return values, ShapeField(self.decoder, [self._thinned(layer, kept) for layer in range(last + 1)])
+        active = [_active_units(*both) for both in zip(highest, deviation, strict=True)]
+        with torch.enable_grad():  # the pruned field is as differentiable as the whole
+            return values, ShapeField(self.decoder, [self._pruned_layer(layer, active) for layer in range(last + 1)])
 
-    def _thinned(self, layer: int, kept: list[Tensor]) -> Layer:
-        """A layer without the rows of its own units that are off, and without the columns of those before."""
+    def _pruned_layer(self, layer: int, active: list[Int[Tensor, "_"]]) -> Layer:
+        """Returns a layer without the rows of its own inactive units, and without the columns of those before."""
         weight, bias = self.layers[layer]
         if layer:
-            fed = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)  # the points
-            weight = weight[:, torch.cat([kept[layer - 1], fed])]
-        return (weight[kept[layer]], bias[kept[layer]]) if layer < len(kept) else (weight.contiguous(), bias)
+            point = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)
+            weight = weight[:, torch.cat([active[layer - 1], point])]
+        return (weight[active[layer]], bias[active[layer]]) if layer < len(active) else (weight.contiguous(), bias)
 
 
-def _on(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Tensor:
-    """The units that come near zero or above, and a few more for a round width."""
+def _active_units(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Int[Tensor, "m"]:
+    """Returns the units that come near zero or above, and a few more for a round width."""
     level = highest / deviation.clamp_min(1e-12)
-    count = -(-int((level > -QUIET).sum()) // ROUND) * ROUND
-    return level.topk(min(max(count, ROUND), len(level))).indices.sort().values
+    count = -(-int((level > -OFF_MARGIN).sum()) // WIDTH_MULTIPLE) * WIDTH_MULTIPLE
+    return level.topk(min(max(count, WIDTH_MULTIPLE), len(level))).indices.sort().values

@@ -1,4 +1,4 @@
-"""A decoder in bfloat16: half the time where the processor has such products, and as right as a search needs."""
+"""A decoder in bfloat16: half the time on processors that multiply in it, and accurate enough for a search."""
 
 from functools import cached_property, lru_cache, partial
 
@@ -14,12 +14,12 @@ from distrace.fields.decoder import CHUNK, Decoder
 from distrace.fields.products import LINEAR_RELU, Layer
 
 PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
-ROWS = 32  # a product's kernel is made anew for each number of rows, which takes longer than the product
-MANY = 1 << 16  # … of fewer rows than these
+ROWS = 32  # rows are padded to a multiple: oneDNN compiles a kernel for each number, longer than a product takes
+MANY = 1 << 16  # rows: from here on the product takes longer
 
 
 class BFloat16Decoder:
-    """The same shapes; values near the surface of an 8 × 512 decoder are off by 1e-4 to 3e-4, and by 1e-3 at most."""
+    """A decoder in bfloat16: near the surface of an 8 × 512 decoder values are off by 1e-4 to 3e-4, at most by 1e-3."""
 
     def __init__(self, decoder: Decoder) -> None:
         self.decoder = decoder
@@ -27,19 +27,19 @@ class BFloat16Decoder:
     def __call__(
         self, points: Float[Tensor, "*batch 3"], code: Float[Tensor, "*#batch length"]
     ) -> Float[Tensor, "*batch"]:
-        """Values, and derivatives as rounded. Points and codes keep their precision."""
+        """Returns values, with derivatives as rounded. Points and codes keep their precision."""
         with torch.autocast(points.device.type, torch.bfloat16):
             return self.decoder(points, code).float()
 
     def field(self, code: Float[Tensor, "*shapes length"]) -> SDF | BatchField[SDF]:
-        """The field of one shape or, from codes [B, length], of B shapes; without derivatives.
+        """Returns the field of one shape or, from codes [B, length], of B shapes; without derivatives.
 
         Raises `ValueError` for a code of another length.
         """
         return self.fields(code) if code.dim() == 2 else self._single(code)
 
     def fields(self, codes: Float[Tensor, "shapes length"]) -> BatchField[SDF]:
-        """The field of several shapes, as `field` gives it."""
+        """Returns the field of several shapes."""
         layers = self.layers(codes)
 
         def evaluate(points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"]) -> Float[Tensor, "n"]:
@@ -57,7 +57,7 @@ class BFloat16Decoder:
 
     @torch.no_grad()
     def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
-        """Those of a field, with biases [*shapes, outputs], in bfloat16, except those that points enter."""
+        """Returns a field's layers, with biases [*shapes, outputs], in bfloat16 except those that points enter."""
         layers = enumerate(self.decoder.folded(self.decoder.checked(code)))
         return [(w if self.decoder.is_fed(number) else w.bfloat16(), b) for number, (w, b) in layers]
 
@@ -67,7 +67,8 @@ class BFloat16Decoder:
     ) -> Float[Tensor, "n"]:
         if shape is not None:
             shape = padded_rows(shape)
-        values = self._run(layers, padded_rows(points), shape).float()
+        with torch.autocast(points.device.type, enabled=False):  # products are in bfloat16 as it is
+            values = self._run(layers, padded_rows(points), shape).float()
         return values if len(values) == len(points) else values[: len(points)]
 
     def _run(
@@ -80,28 +81,31 @@ class BFloat16Decoder:
 
 
 def padded_rows(rows: Shaped[Tensor, "n *_"]) -> Shaped[Tensor, "m *_"]:
-    """With rows of zeros after them, up to a multiple of `ROWS`, where they are not `MANY`."""
+    """Returns rows with zeros after them, up to a multiple of `ROWS`, where they are fewer than `MANY`."""
     missing = -len(rows) % ROWS if len(rows) < MANY else 0
     return pad(rows, (0, 0) * (rows.dim() - 1) + (0, missing)) if missing else rows
 
 
 class PackedDecoder(BFloat16Decoder):
-    """As right as autocast, in half the time.
+    """A decoder in bfloat16 with packed weights: as accurate as autocast, in half the time.
 
-    Weights are laid out once, not at every product, and a product adds its bias and bends by itself.
+    oneDNN packs the weights once, not at every product, and adds bias and ReLU in the product.
     """
 
     @staticmethod
     def has(decoder: Decoder) -> bool:
-        """Whether it has a decoder's layers: none normed, not all fed, nor the last; and PyTorch the products."""
+        """Returns whether it can pack a decoder's layers: no layer norms, and points enter neither all nor the last."""
         specs = decoder.specs
-        normed = bool(specs.norm_layers) and not specs.weight_norm
-        other = normed or specs.xyz_in_all or len(specs.dims) in specs.latent_in or decoder.training
-        return not other and torch.backends.mkldnn.is_available() and hasattr(PRODUCTS, "_linear_pointwise")
+        unusual = decoder.has_layer_norms or specs.xyz_in_all or len(specs.dims) in specs.latent_in
+        return (
+            not (unusual or decoder.training)
+            and torch.backends.mkldnn.is_available()
+            and hasattr(PRODUCTS, "_linear_pointwise")
+        )
 
     @torch.no_grad()
     def layers(self, code: Float[Tensor, "*shapes length"]) -> list[Layer]:
-        """Those of a field; of the ones that code and points enter, only what multiplies points, transposed."""
+        """Returns a field's layers; of those that code and points enter, the transposed weights of points alone."""
         code = self.decoder.checked(code)
         return [self._folded(*layer, code) if self.decoder.is_fed(k) else layer for k, layer in enumerate(self._layers)]
 
@@ -113,33 +117,37 @@ class PackedDecoder(BFloat16Decoder):
     def _run(
         self, layers: list[Layer], points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None
     ) -> Float[Tensor, "n"]:
-        x, last = _placed(layers[0], points, shape, then="relu"), len(layers) - 1
+        x = _from_points(layers[0], points, shape, then="relu")
+        last = len(layers) - 1
         for number, weight in enumerate(self._weights, 1):
             if self.decoder.is_fed(number):
-                placed = _placed(layers[number], points, shape)
-                x = PRODUCTS._linear_pointwise.binary(x, placed, weight, None, "add").relu_()
+                addend = _from_points(layers[number], points, shape)
+                x = PRODUCTS._linear_pointwise.binary(x, addend, weight, None, "add").relu_()
             else:
                 x = _product(x, weight, layers[number][1], "relu" if number < last else "none")
-        return self.decoder.ended(x[:, 0])
+        return self.decoder.output(x[:, 0])
 
     @torch.no_grad()
     def slopes(
         self, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
     ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
-        """Exact values, and their derivatives by the point and by the code, rounded on the way back alone."""
-        layers, on, rows = self.decoder.folded(self.decoder.checked(code)), [], padded_rows(points)
+        """Returns exact values, and their derivatives by point and code; only the backward pass is in bfloat16."""
+        layers = self.decoder.folded(self.decoder.checked(code))
+        rows = padded_rows(points)
+        active: list[Tensor] = []
         x = rows[:, :0]
         for number, layer in enumerate(layers):
             x = F.linear(torch.cat([x, rows], dim=1) if self.decoder.is_fed(number) else x, *layer)
             if number < len(layers) - 1:
-                on.append(x.relu_().sign().bfloat16())
-        x, by_units = x[:, 0], layers[-1][0].expand(len(rows), -1)
+                active.append(x.relu_().sign().bfloat16())
+        x = x[:, 0]
+        by_units = layers[-1][0].expand(len(rows), -1)
         for _ in range(2 if self.decoder.specs.use_tanh else 1):
             x = x.tanh()
             by_units = by_units * (1 - x.square())[:, None]
         by_fed = rows.new_zeros(len(rows), self._fed)
-        for number in range(len(on) - 1, -1, -1):
-            by_units = by_units.bfloat16().mul_(on[number])
+        for number in range(len(active) - 1, -1, -1):
+            by_units = by_units.bfloat16().mul_(active[number])
             units, fed = self._weights_back[number]
             if fed is not None:
                 by_fed += _product(by_units, fed)
@@ -150,19 +158,19 @@ class PackedDecoder(BFloat16Decoder):
 
     @cached_property
     def _layers(self) -> list[Layer]:
-        """Weights, and biases in the precision that they are added in."""
+        """The weights, and the biases in the precision of the sums that they enter."""
         linears = [getattr(self.decoder, f"lin{layer}") for layer in range(self.decoder.depth)]
         layers = [(linear.weight, linear.bias) for linear in linears]
         return [(w, b if self.decoder.is_fed(layer) else b.bfloat16()) for layer, (w, b) in enumerate(layers)]
 
     @cached_property
     def _weights(self) -> list[Tensor]:
-        """Of all layers but the first, without what multiplies code and points, as oneDNN has them for a product."""
+        """The packed weights of all layers but the first, without the columns of code and points."""
         return [_packed(self._of_units(layer)) for layer in range(1, self.decoder.depth)]
 
     @cached_property
     def _weights_back(self) -> list[tuple[Tensor | None, Tensor | None]]:
-        """Of all layers but the last, from its outputs to the units before it, and to code and points."""
+        """The packed transposed weights of all layers but the last: to the units before it, and to code and points."""
         layers = range(self.decoder.depth - 1)
         units = [_packed(self._of_units(layer).T) if layer else None for layer in layers]
         fed = [
@@ -176,7 +184,7 @@ class PackedDecoder(BFloat16Decoder):
         return self.decoder.specs.code_length + 3
 
     def _of_units(self, layer: int) -> Tensor:
-        """A layer's weights of the units before it."""
+        """Returns a layer's weights of the units before it."""
         weight = self._layers[layer][0]
         return weight[:, : -self._fed] if self.decoder.is_fed(layer) else weight
 
@@ -189,10 +197,10 @@ def _product(x: Tensor, weight: Tensor, bias: Tensor | None = None, then: str = 
     return PRODUCTS._linear_pointwise(x, weight, bias, then, [], "")
 
 
-def _placed(
+def _from_points(
     layer: Layer, points: Float[Tensor, "n 3"], shape: Int[Tensor, "n"] | None, then: str = "none"
 ) -> Float[Tensor, "n width"]:
-    """What points, and the codes that are folded into biases, give to a layer; computed in full precision."""
+    """Returns a layer's outputs from points and the codes in its biases alone; computed in full precision."""
     weight, bias = layer
     if shape is not None:
         bias = bias.index_select(0, shape)
@@ -201,9 +209,9 @@ def _placed(
 
 
 def fastest(decoder: Decoder) -> Decoder | BFloat16Decoder:
-    """The decoder as it is, or rounded: on a CPU that multiplies in bfloat16. Others emulate that, and take longer.
+    """Returns the decoder in bfloat16 on a CPU that multiplies in it, or else as it is: emulation takes longer.
 
-    A decoder of another class is asked as it is: it may have another field.
+    A subclass of `Decoder` stays as it is: it may override the field.
     """
     parameter = next(decoder.parameters())
     if type(decoder) is not Decoder or parameter.device.type != "cpu" or parameter.dtype != torch.float32:
@@ -215,6 +223,6 @@ def fastest(decoder: Decoder) -> Decoder | BFloat16Decoder:
 
 @lru_cache
 def _multiplies_in_bfloat16() -> bool:
-    """As the processor says it, not a stopwatch: so that a fit that is run again ends where it did."""
-    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # PyTorch before 2.10 does not tell
+    """Returns what the processor reports, not what a stopwatch says, so that fits are reproducible."""
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()  # PyTorch before 2.10 does not report them
     return any(capabilities.get(name) for name in ("avx512_bf16", "amx_bf16"))

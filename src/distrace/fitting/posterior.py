@@ -18,7 +18,7 @@ from distrace.fields.decoder import FAR
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.methods import completing
 from distrace.fitting.multistart import Step, charged
-from distrace.prior import DEVIATION, Prior, prior_of
+from distrace.prior import START_DEVIATION, Prior, prior_of
 
 CONFIG = CodeFitConfig(iterations=10, starts=1, stages=3, narrowing=0.3, robust=0, sharpening=0)
 
@@ -29,7 +29,7 @@ def plausible(
     """`count` completions; the step of each is its last one, and `start` its number."""
     prior, random = prior_of(model.codes), torch.Generator().manual_seed(seed)
     for number in range(count):
-        draw = prior.code(prior.draw(random, DEVIATION))
+        draw = prior.code(prior.draw(random, START_DEVIATION))
         *steps, last = completing(model, seen, replace(config, starts=1), Prior(draw, prior.basis))
         yield charged(replace(last, start=number), steps)
 

@@ -16,13 +16,14 @@ from distrace.tracing.sphere_tracing import Outcome, TraceConfig, sphere_trace
 def starts(
     sdf: SDF, camera: Camera, radius: float, config: TraceConfig
 ) -> tuple[Float[Tensor, "*batch height width"], int]:
-    """Distances at which the rays of an image may start, and the evaluations that this took.
+    """Returns distances at which the rays of an image may start, and the evaluations that this took.
 
-    Each level marches `coarse_steps` and hands its distances to four rays each. A coarse ray waits where the surface
-    comes nearer than its pixel is wide: its neighbours may hit what it passes by. One that missed or left the bounds
-    hands nothing on. Depth is never taken from a coarse ray.
+    Each level marches `coarse_steps` and gives its distances to four rays each. A coarse ray stops where the surface is
+    nearer than its pixel is wide, as its neighbours may hit it. A ray that left the bounds gives none. Depth is never
+    taken from a coarse ray.
     """
-    start, evaluations = None, 0
+    start = None
+    evaluations = 0
     for level in range(config.coarse_levels, 0, -1):
         coarse = camera.resized(0.5**level)
         rays = coarse.rays()

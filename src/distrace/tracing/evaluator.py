@@ -1,27 +1,28 @@
-"""The field as the tracer evaluates it: in the unit sphere, of one shape or several, exactly or roughly, counted."""
+"""The field as the tracer evaluates it: in the unit sphere, exactly or in bfloat16, with evaluations counted."""
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from distrace.fields.base import SDF, Counted, asked
+from distrace.fields.base import SDF, Counted, evaluate_checked
 from distrace.fields.batch import BatchField, CountedBatch
 from distrace.fields.decoder import ShapeField
 from distrace.fields.precision import fastest
 from distrace.tracing.images import Lines
 
-ROUGH_ERROR = 7e-4  # of values: 8 × 512 decoders in bfloat16 near their surfaces, but for one in a thousand
+ROUGH_ERROR = 7e-4  # of 999 in 1,000 values of 8 × 512 decoders in bfloat16 near their surfaces
 
 
 class Evaluator:
-    """Values along rays, in radii of the sphere, divided by the Lipschitz constant once it is known.
+    """Evaluates a field along rays, in radii of the sphere, divided by the Lipschitz bound once it is known.
 
-    `rough` values are in cheaper products, where this machine has them, and good to `error`; elsewhere they are exact,
-    and the error is zero. `cheap` is what `cheaper` gives for the field.
+    `rough` values are in bfloat16 where that is faster on this machine, and good to `error`; elsewhere they are exact,
+    and the error is zero. `cheap` is the field that `cheaper` returns.
     """
 
     def __init__(self, sdf: SDF | BatchField, radius: float, cheap: SDF | BatchField | None = None) -> None:
-        self.sdf, self.radius = sdf, radius
+        self.sdf = sdf
+        self.radius = radius
         self.shapes = len(sdf) if isinstance(sdf, BatchField) else 1
         self.cheap = _counting(sdf, cheap)
         self.error = 0.0 if cheap is None else ROUGH_ERROR / radius
@@ -29,16 +30,17 @@ class Evaluator:
         self.evaluations = 0
 
     def exact(self, lines: Lines, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
-        """Values at distances along rays."""
+        """Returns values at distances along rays."""
         return self.at(lines.at(t), lines.view)
 
     def rough(self, lines: Lines, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
+        """Returns values at distances along rays, good to `error`."""
         return self.at(lines.at(t), lines.view, rough=True)
 
     def at(
         self, points: Float[Tensor, "*k n 3"], shape: Int[Tensor, "n"] | None, *, rough: bool = False
     ) -> Float[Tensor, "*k n"]:
-        """Values at points of the unit sphere, each of the shape of its number."""
+        """Returns values at points of the unit sphere, each of the shape of its number."""
         if not points.numel():
             return points[..., 0]
         self.evaluations += points.numel() // 3
@@ -47,31 +49,31 @@ class Evaluator:
         if isinstance(field, BatchField):
             values = field.values(world, points.new_zeros(1, dtype=torch.int64) if shape is None else shape)
         else:
-            values = asked(field, world)
+            values = evaluate_checked(field, world)
         if self.scale is None:
             return values if self.radius == 1 else values / self.radius
         return values * (self.scale[shape] if self.shapes > 1 else self.scale)
 
     def normalise(self, lipschitz: Float[Tensor, "shapes"]) -> None:
-        """From here on |f| is at most the distance to the surface."""
+        """Scales later values so that |f| is at most the distance to the surface."""
         self.scale = (self.radius * lipschitz).reciprocal()
         self.error = self.error / float(lipschitz.min()) if self.error else 0.0
 
 
 def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
-    """A decoder's field in bfloat16 products, where those are faster on this machine; else none."""
+    """Returns a decoder's field in bfloat16 where that is faster on this machine, or else None."""
     if isinstance(sdf, Counted):
         return cheaper(sdf.sdf)
     code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
     decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
     if decoder is None or code is None:
         return None
-    quick = fastest(decoder)
-    return None if quick is decoder else quick.field(code.detach())
+    fast_decoder = fastest(decoder)
+    return None if fast_decoder is decoder else fast_decoder.field(code.detach())
 
 
 def _counting(sdf: SDF | BatchField, cheap: SDF | BatchField | None) -> SDF | BatchField | None:
-    """Counts what is evaluated roughly where exact values are counted."""
+    """Returns the cheap field, counting where the exact one counts."""
     if isinstance(sdf, CountedBatch) and isinstance(cheap, BatchField):
         return sdf.counting(cheap)
     if isinstance(sdf, Counted) and cheap is not None and not isinstance(cheap, BatchField):

@@ -17,10 +17,10 @@ BRANCH = 3  # blocks split into 3 × 3: the middle part keeps the ray of the who
 
 @dataclass(frozen=True)
 class Lines:
-    """Rays that are traced together. They start where the sphere comes nearest to their camera, in radii."""
+    """Rays that are traced together, in radii. They start at the sphere's nearest distance from their camera."""
 
-    table: Float[Tensor, "n 8"]  # origin, direction, how far to the sphere's middle, and 1 − (how far past it)²
-    view: Int[Tensor, "n"] | None  # the image of each, and its shape; none where there is but one
+    table: Float[Tensor, "n 8"]  # origin, direction, distance at the point nearest to the centre, 1 − (its radius)²
+    view: Int[Tensor, "n"] | None  # the number of each ray's image, and of its shape; None for a single image
 
     @staticmethod
     def of(origins: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"], view: Int[Tensor, "n"] | None) -> "Lines":
@@ -28,13 +28,13 @@ class Lines:
         inside = 1 - torch.addcmul(origins, middle, directions).square().sum(1, keepdim=True)
         return Lines(torch.cat([origins, directions, middle, inside], dim=1), view)
 
-    def __getitem__(self, some: Int[Tensor, "m"]) -> "Lines":
-        view = None if self.view is None else self.view.index_select(0, some)
-        return Lines(self.table.index_select(0, some), view)
+    def __getitem__(self, index: Int[Tensor, "m"]) -> "Lines":
+        view = None if self.view is None else self.view.index_select(0, index)
+        return Lines(self.table.index_select(0, index), view)
 
     @cached_property
     def parts(self) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 2"]]:
-        """Origins, directions, and the rest."""
+        """Origins, directions, and the last two columns of the table."""
         origins, directions, rest = self.table.split([3, 3, 2], 1)
         return origins, directions, rest
 
@@ -42,22 +42,22 @@ class Lines:
         return torch.addcmul(self.parts[0], t[..., None], self.parts[1])
 
     def in_sphere(self, radius: float = 1.0) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """From where to where each ray is in a sphere of this radius; near ≥ far where it never is."""
+        """Returns the interval of each ray in a sphere of this radius; near ≥ far where it misses."""
         middle, inside = self.parts[2].unbind(1)
         half = (inside if radius == 1 else inside + (radius**2 - 1)).clamp_min(0).sqrt()
         return (middle - half).clamp_min(0), middle + half
 
-    def of_view(self, each: Float[Tensor, "views"]) -> Float[Tensor, "#n"]:
-        """What is known of each view, for each ray."""
-        return each if self.view is None else each.index_select(0, self.view)
+    def of_view(self, values: Float[Tensor, "views"]) -> Float[Tensor, "#n"]:
+        """Returns values of views for each ray."""
+        return values if self.view is None else values.index_select(0, self.view)
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """All rays that may be traced, by number; those of images in a grid that is padded to whole blocks."""
+    """All rays that may be traced, by number; the grids of images are padded to whole blocks."""
 
     lines: Lines
-    start: Float[Tensor, "#n"]  # how far the origins are from the camera
+    start: Float[Tensor, "#n"]  # distances of the origins from the camera
     width: Float[Tensor, "views"]  # of a pixel at the origins …
     growth: Float[Tensor, "views"]  # … by how much per unit of distance …
     middle: Float[Tensor, "views"]  # … and in the middle of the sphere
@@ -67,9 +67,9 @@ class Pixels:
 
     @staticmethod
     def of_camera(camera: Camera, rays: Rays, radius: float, largest: float) -> "Pixels":
-        """Of an image or a batch of them; in the middle of the sphere the cones of blocks stay within `largest`.
+        """Returns the pixels of an image or a batch; at the sphere's centre the cones of blocks stay within `largest`.
 
-        The last rows and columns are repeated in the padding: no farther from the middle of their blocks than others.
+        Padding repeats the last rows and columns: no farther from the middle of their blocks than others.
         """
         pose = camera.T_world_camera.reshape(-1, 4, 4)
         inverse = torch.linalg.inv(camera.intrinsics.reshape(-1, 3, 3))
@@ -77,12 +77,14 @@ class Pixels:
         shift = (eye.norm(dim=1) - 1).clamp_min(0)
         growth = torch.linalg.matrix_norm(inverse[:, :2, :2], 2)
         width = growth * shift
-        middle, level = width + growth, 0
+        middle = width + growth
+        level = 0
         pixel = float(middle.max())
         least = min(camera.height, camera.width)
         while reach(BRANCH ** (level + 1)) * pixel < largest and BRANCH ** (level + 1) <= least:
             level += 1
-        views, side = len(eye), BRANCH**level
+        views = len(eye)
+        side = BRANCH**level
         rows, columns = (-(-size // side) * side for size in (camera.height, camera.width))
         directions = rays.directions.reshape(1, views, camera.height, camera.width, 3)
         directions = pad(directions, (0, 0, 0, columns - camera.width, 0, rows - camera.height), mode="replicate")[0]
@@ -94,37 +96,39 @@ class Pixels:
 
     @staticmethod
     def of_rays(rays: Rays) -> "Pixels":
-        """Rays that are no image, from where they enter a sphere of twice the radius."""
+        """Returns rays that are no image, starting as they enter a sphere of twice the radius."""
         start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
-        lines, zero, count = Lines.of(rays.at(start), rays.directions, None), start.new_zeros(1), len(start)
+        lines = Lines.of(rays.at(start), rays.directions, None)
+        zero = start.new_zeros(1)
+        count = len(start)
         return Pixels(lines, start, zero, zero, zero + torch.inf, (1, 1, count), (count,))
 
     @cached_property
     def span(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-        """From where to where each ray is in the sphere."""
+        """The interval of each ray in the sphere."""
         return self.lines.in_sphere()
 
     def blocks(self) -> Int[Tensor, "n"]:
-        """The middle rays of all of the largest blocks."""
+        """Returns the middle rays of all of the largest blocks."""
         views, rows, columns = self.shape
         side = BRANCH**self.level
         number = torch.arange(views * rows * columns, device=self.width.device).reshape(views * rows, columns)
         return number[side // 2 :: side, side // 2 :: side].reshape(-1)
 
     def split(self, blocks: Int[Tensor, "n"], side: int) -> Int[Tensor, "m"]:
-        """The middle rays of the nine parts of each block, nine after nine; `side` is that of the parts, in pixels."""
+        """Returns the middle rays of the nine parts of each block, in its order; parts are `side` pixels wide."""
         offset = torch.arange(-side, side + 1, side, device=blocks.device)
         around = (offset[:, None] * self.shape[2] + offset).reshape(-1)
         return (blocks[:, None] + around).reshape(-1)
 
-    def image(self, each: Float[Tensor, "k n"]) -> Float[Tensor, "k *size"]:
-        """What is known of each ray, without the padding."""
-        whole = each.reshape(len(each), *self.shape)
+    def image(self, values: Float[Tensor, "k n"]) -> Float[Tensor, "k *size"]:
+        """Returns values of rays as images, without the padding."""
+        images = values.reshape(len(values), *self.shape)
         if len(self.size) > 1:
-            whole = whole[..., : self.size[-2], : self.size[-1]]
-        return whole.reshape(len(each), *self.size)
+            images = images[..., : self.size[-2], : self.size[-1]]
+        return images.reshape(len(values), *self.size)
 
 
 def reach(side: int) -> float:
-    """From the middle of a block to the middle of its farthest pixel, in pixels."""
+    """Returns the distance from the middle of a block to that of its farthest pixel, in pixels."""
     return (side - 1) / math.sqrt(2)

@@ -1,4 +1,4 @@
-"""The default tracer: cells that may hold surface, cones of blocks of pixels, single rays."""
+"""The default tracer: occupied cells, cones of blocks of pixels, single rays."""
 
 import math
 from dataclasses import dataclass, replace
@@ -17,17 +17,17 @@ from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import BRACKET, EXACT, EXACT_ALONE, ROUGH, Queried, State, evaluations, march, march_cones
 from distrace.tracing.sphere_tracing import Outcome, Trace
 
-LARGEST = 0.012  # radii: the cones of the largest blocks reach no farther; a fifth of a cell of the occupancy
-GAP = 0.003  # radii of a ray, and half a pixel, at most, that the balls around its samples may leave unchecked
-FINEST = 16  # × what numbers can tell of 1: no tolerance is less, in radii
-FINE = 0.05  # pixels: the tolerance of a hit, where that is less than a configuration's
+LARGEST = 0.012  # radii: of the cones of the largest blocks; a fifth of a cell of the occupancy
+GAP = 0.003  # radii, and half a pixel: the most that the balls around a ray's samples may leave unchecked
+FINEST = 16  # × the machine epsilon: the least tolerance, in radii
+FINE = 0.05  # pixels: the tolerance of a hit, if less than the configuration's
 
 
 @dataclass(frozen=True)
 class TracerConfig:
-    """`tolerance`: how far off a hit may be, in radii. `lipschitz`: a bound on |∇f|; measured if not given.
+    """`tolerance`: the largest error of a hit, in radii. `lipschitz`: a bound on |∇f|, by default measured.
 
-    A field that is steeper than the bound may lose what is thin; one that is flatter takes more steps. An occupancy has
+    A field that is steeper than the bound may lose thin parts; one that is flatter takes more steps. An occupancy has
     the bound that it was measured with, and takes no other.
     """
 
@@ -36,7 +36,7 @@ class TracerConfig:
 
     def __post_init__(self) -> None:
         given = [self.tolerance] if self.lipschitz is None else [self.tolerance, self.lipschitz]
-        if not all(0 < each < math.inf for each in given):
+        if not all(0 < value < math.inf for value in given):
             raise ValueError(f"{self} cannot trace: the tolerance and the Lipschitz constant must be positive, finite")
 
 
@@ -49,7 +49,7 @@ def trace_images(
     config: TracerConfig = TracerConfig(),
     occupancy: Occupancy | None = None,
 ) -> tuple[Trace, Occupancy]:
-    """Traces the rays of a camera, or of a batch of them; the occupancy serves further views of the same field.
+    """Traces the rays of a camera, or of a batch; the returned occupancy serves further views of the same field.
 
     Raises `ValueError` for an occupancy of another radius, number of shapes or Lipschitz constant, and for another
     number of cameras than of shapes.
@@ -57,19 +57,21 @@ def trace_images(
     views = camera.intrinsics.shape[:-2].numel()
     if isinstance(sdf, BatchField) and len(sdf) != views:
         raise ValueError(f"a field of {len(sdf)} shapes and {views} cameras were given; give a camera for each shape")
-    pixels = Pixels.of_camera(camera, rays, radius, LARGEST)
-    return _traced(sdf, pixels, radius, config, occupancy)
+    with torch.autocast(rays.origins.device.type, enabled=False):  # distances need their precision
+        pixels = Pixels.of_camera(camera, rays, radius, LARGEST)
+        return _traced(sdf, pixels, radius, config, occupancy)
 
 
 @torch.no_grad()
 def trace_rays(
     sdf: SDF, rays: Rays, radius: float = 1.0, config: TracerConfig = TracerConfig(), occupancy: Occupancy | None = None
 ) -> tuple[Trace, Occupancy]:
-    """The same for rays [n] that are no image: each is marched on its own. Raises `ValueError` as `trace_images`."""
+    """Traces rays [n] that are no image, each on its own. Raises `ValueError` as `trace_images`."""
     if isinstance(sdf, BatchField):
         raise ValueError(f"a field of {len(sdf)} shapes was given with rays; give one of them, as `field[0]`")
-    pixels = Pixels.of_rays(Rays(rays.origins / radius, rays.directions))
-    return _traced(sdf, pixels, radius, config, occupancy)
+    with torch.autocast(rays.origins.device.type, enabled=False):
+        pixels = Pixels.of_rays(Rays(rays.origins / radius, rays.directions))
+        return _traced(sdf, pixels, radius, config, occupancy)
 
 
 def _traced(
@@ -89,61 +91,69 @@ def _traced(
 
 
 def _spans(evaluator: Evaluator, occupancy: Occupancy, pixels: Pixels) -> tuple[Int[Tensor, "n"], Float[Tensor, "3 n"]]:
-    """The rays that may meet surface; from where and up to where, and from where if f is steeper than its bound."""
+    """Returns the rays that may meet surface; their begin, end, and their begin if f is steeper than its bound."""
     number = pixels.blocks()
     span = occupancy.entered(pixels.lines[number])
     for level in range(pixels.level, 0, -1):
         number, span = _not_empty(number, span)
-        lines, cone = pixels.lines[number], reach(BRANCH**level)
-        width, growth = (cone * lines.of_view(each) for each in (pixels.width, pixels.growth))
-        wide = torch.addcmul(width, growth, span[1])
-        span = march_cones(evaluator.rough, lines, span, wide, evaluator.error)
-        number, span = pixels.split(number, BRANCH ** (level - 1)), span.repeat_interleave(BRANCH**2, 1)
+        lines = pixels.lines[number]
+        cone = reach(BRANCH**level)
+        width = cone * lines.of_view(pixels.width)
+        growth = cone * lines.of_view(pixels.growth)
+        radius = torch.addcmul(width, growth, span[1])
+        span = march_cones(evaluator.rough, lines, span, radius, evaluator.error)
+        number = pixels.split(number, BRANCH ** (level - 1))
+        span = span.repeat_interleave(BRANCH**2, 1)
     t, last, begin = span.unbind(0)
-    near, far = (each[number] for each in pixels.span)
+    near, far = (bound[number] for bound in pixels.span)
     return _not_empty(number, torch.stack([t.maximum(near), last.minimum(far), begin.maximum(near)]))
 
 
 def _marched(
     evaluator: Evaluator, pixels: Pixels, tolerance: float, number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]
 ) -> tuple[State, Shaped[Tensor, "n"]]:
-    """What becomes of these rays, and how often f was evaluated for each."""
+    """Returns the final state of these rays, and the number of evaluations of f for each."""
     t, far, begin = span.unbind(0)
-    lines, every = pixels.lines[number], torch.arange(len(number), device=number.device)
+    lines = pixels.lines[number]
+    all_rays = torch.arange(len(number), device=number.device)
     finest = FINEST * torch.finfo(t.dtype).eps
     limits = [(pixels.middle / 4).clamp(finest, GAP / 2), (FINE * pixels.middle).clamp(finest, max(tolerance, finest))]
-    gap, tolerances = (lines.of_view(each).expand_as(t) for each in limits)
-    state = State.begun(evaluator.rough, lines, t, far, gap, tolerances)
-    states, clear = torch.stack(state), state.value > evaluator.error
-    queried: list[Queried] = [(every, 1)]
+    gap, tolerances = (lines.of_view(limit).expand_as(t) for limit in limits)
+    state = State.begin(evaluator.rough, lines, t, far, gap, tolerances)
+    states = torch.stack(state)
+    clear = state.value > evaluator.error
+    queried: list[Queried] = [(all_rays, 1)]
     if evaluator.error:
-        queried += march(evaluator.rough, lines, states, every[clear], ROUGH, evaluator.error)
-    going, again = states[0] < far, every[~clear]
-    if len(again):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
-        limits = (each[again] for each in (begin, far, gap, tolerances))
-        states[:, again] = torch.stack(State.begun(evaluator.exact, lines[again], *limits))
-        queried.append((again, 1))
-        going = going & (states[1] > -tolerances)
-    queried += march(evaluator.exact, lines, states, every[going], EXACT if evaluator.error else EXACT_ALONE)
+        queried += march(evaluator.rough, lines, states, all_rays[clear], ROUGH, evaluator.error)
+    active = states[0] < far
+    restarted = all_rays[~clear]
+    if len(restarted):  # where f is steeper than the bound a ball is too large, and a cone may end in the solid
+        limits = (limit[restarted] for limit in (begin, far, gap, tolerances))
+        states[:, restarted] = torch.stack(State.begin(evaluator.exact, lines[restarted], *limits))
+        queried.append((restarted, 1))
+        active = active & (states[1] > -tolerances)
+    queried += march(evaluator.exact, lines, states, all_rays[active], EXACT if evaluator.error else EXACT_ALONE)
     return State(*states.unbind(0)), evaluations(queried, len(number))
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
-    given, shapes, radius = len(occupancy.occupied), evaluator.shapes, evaluator.radius
-    if occupancy.radius != radius:
-        raise ValueError(f"an occupancy for a radius of {occupancy.radius} was given with {radius}; leave it out")
+    given = len(occupancy.occupied)
+    shapes = evaluator.shapes
+    if occupancy.radius != evaluator.radius:
+        radii = f"an occupancy for a radius of {occupancy.radius} was given with {evaluator.radius}"
+        raise ValueError(f"{radii}; leave it out")
     if given != shapes:
         raise ValueError(f"an occupancy of {given} shapes was given with a field of {shapes}; leave the occupancy out")
     if lipschitz is not None and (occupancy.lipschitz != lipschitz).any():
-        known = f"{float(occupancy.lipschitz.max()):.4g}"
-        raise ValueError(f"lipschitz={lipschitz} was given with an occupancy for {known}; leave the occupancy out")
+        measured = f"{float(occupancy.lipschitz.max()):.4g}"
+        raise ValueError(f"lipschitz={lipschitz} was given with an occupancy for {measured}; leave the occupancy out")
 
 
 def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
-    """Without the rays of which nothing is left."""
+    """Returns the rays with a non-empty interval."""
     t, end, _ = span.unbind(0)
-    some = t < end
-    return number[some], span[:, some]
+    active = t < end
+    return number[active], span[:, active]
 
 
 def _result(
@@ -154,19 +164,19 @@ def _result(
     counts: Shaped[Tensor, "n"],
     radius: float,
 ) -> Trace:
-    """What became of all rays, in the world's lengths; those without a state passed the sphere's middle."""
+    """Returns the trace of all rays, in the world's lengths; rays without a state come closest at the centre."""
     at = state.root.clamp(state.t - state.tolerance, torch.add(state.end, state.tolerance, alpha=BRACKET + 1))
     outcome = (at < far) * int(Outcome.HIT)  # or ESCAPED, which is 0
-    left = state.t < state.end
-    outcome = outcome.masked_fill(left, int(Outcome.EXHAUSTED))
-    outcome = outcome.masked_fill(left & (state.value <= 0), int(Outcome.INSIDE))
+    unfinished = state.t < state.end
+    outcome = outcome.masked_fill(unfinished, int(Outcome.EXHAUSTED))
+    outcome = outcome.masked_fill(unfinished & (state.value <= 0), int(Outcome.INSIDE))
     hit = outcome == int(Outcome.HIT)
-    found = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, counts]
+    rows = [torch.where(hit, at, torch.inf), torch.where(hit, at, state.closest), outcome, counts]
     near, far = pixels.span
-    beside = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
+    middle = torch.where(near < far, near.lerp(far, 0.5), torch.inf)
     zero = torch.zeros_like(near)
-    table = torch.stack([torch.full_like(near, torch.inf), beside, zero, zero])
-    table.index_copy_(1, number, torch.stack([each.to(near.dtype) for each in found]))
+    table = torch.stack([torch.full_like(near, torch.inf), middle, zero, zero])
+    table.index_copy_(1, number, torch.stack([row.to(near.dtype) for row in rows]))
     table[:2].add_(pixels.start).mul_(radius)
     distance, closest, outcome, counts = pixels.image(table).unbind(0)
     return Trace(distance, outcome.long(), closest, closest, counts.long())
