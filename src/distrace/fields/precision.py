@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.nn import functional as F
 from torch.nn.functional import pad
 
-from distrace.fields.base import SDF, flattened, in_chunks
+from distrace.fields.base import SDF, Counted, flattened, in_chunks
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import CHUNK, Decoder
 from distrace.fields.products import LINEAR_RELU, Layer
@@ -219,6 +219,18 @@ def fastest(decoder: Decoder) -> Decoder | BFloat16Decoder:
     if not _multiplies_in_bfloat16():
         return decoder
     return PackedDecoder(decoder) if PackedDecoder.has(decoder) else BFloat16Decoder(decoder)
+
+
+def fastest_field(sdf: SDF | BatchField) -> SDF | BatchField | None:
+    """Returns a decoder's field in bfloat16 where that is faster on this machine, or else None."""
+    if isinstance(sdf, Counted):
+        return fastest_field(sdf.sdf)
+    code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
+    decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
+    if decoder is None or code is None:
+        return None
+    fast_decoder = fastest(decoder)
+    return None if fast_decoder is decoder else fast_decoder.field(code.detach())
 
 
 @lru_cache

@@ -6,8 +6,6 @@ from torch import Tensor
 
 from distrace.fields.base import SDF, Counted, evaluate_checked
 from distrace.fields.batch import BatchField, CountedBatch
-from distrace.fields.decoder import ShapeField
-from distrace.fields.precision import fastest
 from distrace.tracing.images import Lines
 
 ROUGH_ERROR = 7e-4  # of 999 in 1,000 values of 8 × 512 decoders in bfloat16 near their surfaces
@@ -17,7 +15,7 @@ class Evaluator:
     """Evaluates a field along rays, in radii of the sphere, divided by the Lipschitz bound once it is known.
 
     `rough` values are in bfloat16 where that is faster on this machine, and good to `error`; elsewhere they are exact,
-    and the error is zero. `cheap` is the field that `cheaper` returns.
+    and the error is zero. `cheap` is the field that `fastest_field` returns.
     """
 
     def __init__(self, sdf: SDF | BatchField, radius: float, cheap: SDF | BatchField | None = None) -> None:
@@ -30,11 +28,9 @@ class Evaluator:
         self.evaluations = 0
 
     def exact(self, lines: Lines, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
-        """Returns values at distances along rays."""
         return self.at(lines.at(t), lines.view)
 
     def rough(self, lines: Lines, t: Float[Tensor, "*k n"]) -> Float[Tensor, "*k n"]:
-        """Returns values at distances along rays, good to `error`."""
         return self.at(lines.at(t), lines.view, rough=True)
 
     def at(
@@ -58,18 +54,6 @@ class Evaluator:
         """Scales later values so that |f| is at most the distance to the surface."""
         self.scale = (self.radius * lipschitz).reciprocal()
         self.error = self.error / float(lipschitz.min()) if self.error else 0.0
-
-
-def cheaper(sdf: SDF | BatchField) -> SDF | BatchField | None:
-    """Returns a decoder's field in bfloat16 where that is faster on this machine, or else None."""
-    if isinstance(sdf, Counted):
-        return cheaper(sdf.sdf)
-    code = sdf.codes if isinstance(sdf, BatchField) else getattr(sdf, "code", None)
-    decoder = getattr(sdf.evaluate, "decoder", None) if isinstance(sdf, BatchField | ShapeField) else None
-    if decoder is None or code is None:
-        return None
-    fast_decoder = fastest(decoder)
-    return None if fast_decoder is decoder else fast_decoder.field(code.detach())
 
 
 def _counting(sdf: SDF | BatchField, cheap: SDF | BatchField | None) -> SDF | BatchField | None:

@@ -100,8 +100,7 @@ class Pixels:
         start = meet_sphere(rays, 2.0).near.nan_to_num(posinf=0.0)
         lines = Lines.of(rays.at(start), rays.directions, None)
         zero = start.new_zeros(1)
-        count = len(start)
-        return Pixels(lines, start, zero, zero, zero + torch.inf, (1, 1, count), (count,))
+        return Pixels(lines, start, zero, zero, zero + torch.inf, (1, 1, len(start)), (len(start),))
 
     @cached_property
     def span(self) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
@@ -123,9 +122,8 @@ class Pixels:
 
     def image(self, values: Float[Tensor, "k n"]) -> Float[Tensor, "k *size"]:
         """Returns values of rays as images, without the padding."""
-        images = values.reshape(len(values), *self.shape)
-        if len(self.size) > 1:
-            images = images[..., : self.size[-2], : self.size[-1]]
+        rows, columns = (1, *self.size)[-2:]
+        images = values.reshape(len(values), *self.shape)[..., :rows, :columns]
         return images.reshape(len(values), *self.size)
 
 

@@ -61,9 +61,8 @@ def march_cones(
 ) -> Float[Tensor, "3 n"]:
     """Advances each block's cone while the clear ball around its middle ray covers the cone.
 
-    `span` holds the begin and the end of a cone's possible surface, and the begin of its march. `radius` is the cone's
-    at the end. A ball of radius r covers a cone of radius ρ for √(r² − ρ²) from its centre. Values are good to an
-    `error`, which is subtracted.
+    `span`: the begin and the end of a cone's possible surface, and the begin of its march; `radius`: the cone's at the
+    end. A ball of radius r covers a cone of radius ρ for √(r² − ρ²) from its centre. Values are good to an `error`.
     """
     t, far, begin = span.unbind(0)
     zero = span.new_zeros(())

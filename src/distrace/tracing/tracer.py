@@ -10,9 +10,10 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
+from distrace.fields.precision import fastest_field
 from distrace.rays import Rays
 from distrace.tracing.bounds import Occupancy, find_occupancy
-from distrace.tracing.evaluator import Evaluator, cheaper
+from distrace.tracing.evaluator import Evaluator
 from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import BRACKET, EXACT, EXACT_ALONE, ROUGH, Queried, State, evaluations, march, march_cones
 from distrace.tracing.sphere_tracing import Outcome, Trace
@@ -51,8 +52,7 @@ def trace_images(
 ) -> tuple[Trace, Occupancy]:
     """Traces the rays of a camera, or of a batch; the returned occupancy serves further views of the same field.
 
-    Raises `ValueError` for an occupancy of another radius, number of shapes or Lipschitz constant, and for another
-    number of cameras than of shapes.
+    Raises `ValueError` for an occupancy of another radius, number of shapes or Lipschitz constant, or too few cameras.
     """
     views = camera.intrinsics.shape[:-2].numel()
     if isinstance(sdf, BatchField) and len(sdf) != views:
@@ -77,7 +77,7 @@ def trace_rays(
 def _traced(
     sdf: SDF | BatchField, pixels: Pixels, radius: float, config: TracerConfig, occupancy: Occupancy | None
 ) -> tuple[Trace, Occupancy]:
-    cheap = cheaper(sdf) if occupancy is None else occupancy.cheap
+    cheap = fastest_field(sdf) if occupancy is None else occupancy.cheap
     evaluator = Evaluator(sdf, radius, cheap)
     if occupancy is None:
         occupancy = replace(find_occupancy(evaluator, pixels.width, config.lipschitz), cheap=cheap)
@@ -137,13 +137,12 @@ def _marched(
 
 
 def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) -> None:
-    given = len(occupancy.occupied)
-    shapes = evaluator.shapes
     if occupancy.radius != evaluator.radius:
-        radii = f"an occupancy for a radius of {occupancy.radius} was given with {evaluator.radius}"
-        raise ValueError(f"{radii}; leave it out")
-    if given != shapes:
-        raise ValueError(f"an occupancy of {given} shapes was given with a field of {shapes}; leave the occupancy out")
+        radii = f"{occupancy.radius} was given with {evaluator.radius}"
+        raise ValueError(f"an occupancy for a radius of {radii}; leave it out")
+    if len(occupancy.occupied) != evaluator.shapes:
+        fields = f"{len(occupancy.occupied)} shapes was given with a field of {evaluator.shapes}"
+        raise ValueError(f"an occupancy of {fields}; leave the occupancy out")
     if lipschitz is not None and (occupancy.lipschitz != lipschitz).any():
         measured = f"{float(occupancy.lipschitz.max()):.4g}"
         raise ValueError(f"lipschitz={lipschitz} was given with an occupancy for {measured}; leave the occupancy out")
@@ -151,8 +150,7 @@ def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) 
 
 def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Returns the rays with a non-empty interval."""
-    t, end, _ = span.unbind(0)
-    active = t < end
+    active = span[0] < span[1]
     return number[active], span[:, active]
 
 
