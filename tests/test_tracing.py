@@ -15,6 +15,7 @@ from distrace.errors import DoubtfulResult
 from distrace.fields import primitives
 from distrace.fields.base import SDF, Counted
 from distrace.fields.batch import CountedBatch
+from distrace.fields.precision import fastest_field
 from distrace.rays import Rays, meet_sphere
 from distrace.render import Buffers, render
 from distrace.tracing.evaluator import ROUGH_ERROR, Evaluator

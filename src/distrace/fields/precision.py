@@ -10,7 +10,7 @@ from torch.nn.functional import pad
 
 from distrace.fields.base import SDF, Counted, flattened, in_chunks
 from distrace.fields.batch import BatchField
-from distrace.fields.decoder import CHUNK, Decoder
+from distrace.fields.decoder import CHUNK, Decoder, ShapeField
 from distrace.fields.products import LINEAR_RELU, Layer
 
 PRODUCTS = torch.ops.mkldnn  # oneDNN's, which Inductor uses
