@@ -150,7 +150,8 @@ def _check(occupancy: Occupancy, evaluator: Evaluator, lipschitz: float | None) 
 
 def _not_empty(number: Int[Tensor, "n"], span: Float[Tensor, "3 n"]) -> tuple[Int[Tensor, "m"], Float[Tensor, "3 m"]]:
     """Returns the rays with a non-empty interval."""
-    active = span[0] < span[1]
+    t, end, _ = span.unbind(0)
+    active = t < end
     return number[active], span[:, active]
 
 
