@@ -220,7 +220,7 @@ def test_rays_of_a_moved_camera_are_those_that_are_compared() -> None:
     view = Retraced.of(sdf, VIEW, 1.0, DOUBLE)
     nearer = replace(VIEW, T_world_camera=VIEW.T_world_camera.clone())
     nearer.T_world_camera[:3, 3] *= 1 - 1e-7
-    moved, here = view.traced_anew(sdf, nearer), view.traced_anew(sdf, VIEW)
+    moved, here = view.retraced(sdf, nearer), view.retraced(sdf, VIEW)
     assert (moved["distance"] < here["distance"]).all()
     exact = of_sphere(nearer, CENTRE, CENTRE.new_tensor(RADIUS), view.trace.hit)
     for name, image in exact.items():

@@ -88,9 +88,9 @@ def ratio_rows(subject: Subject) -> Iterator[tuple[RatioRow, Float[Tensor, "heig
     view, rays = Retraced.of(subject.sdf, subject.camera, 1.0, DOUBLE), subject.camera.rays()
     marched = march(subject.sdf, rays, meet_sphere(rays), queries=max(QUERIES))
     missed = marched.distance[view.trace.hit].isinf()
-    here = view.hits_anew(subject.sdf, subject.camera)
+    here = view.retraced_hits(subject.sdf, subject.camera)
     for parameter, move in subject.moves.items():
-        central, bend = differences(partial(_moved, view.hits_anew, move), here, DOUBLE.step, here["depth"])
+        central, bend = differences(partial(_moved, view.retraced_hits, move), here, DOUBLE.step, here["depth"])
         kinked = bend["depth"].masked_fill(missed, torch.nan)
         for method, seen in _methods(view, marched).items():
             slopes = derivatives(partial(_moved, seen, move), here["depth"])
