@@ -8,8 +8,10 @@ from experiments.commands.photographs import Photographs
 from experiments.commands.procedural import Procedural
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
 from experiments.commands.training_data import Card, Choices, Splits
+from experiments.commands.views import Views
 
 COMMANDS = {
+    "views": Views,
     "fields": Fields,
     "growth": Growth,
     "memory": Memory,

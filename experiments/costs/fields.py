@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from distrace.benchmarks.hard_fields import hard_fields
 from distrace.benchmarks.measuring import OUTLIER, reference_depth
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.metrics import depth_errors
 from distrace.render import STRATEGIES, render
 from distrace.tracing.sphere_tracing import Outcome
+from experiments.fields.analytic import hard_fields
 
 COUNT = 5 * len(STRATEGIES)  # of rows
 
@@ -33,7 +33,7 @@ class FieldRow:
 def field_rows(decoder: SDF, camera: Camera) -> Iterator[FieldRow]:
     """Every strategy on every field."""
     for name, hard in hard_fields(decoder, camera).items():
-        truth = reference_depth(lambda points, hard=hard: hard.sdf(points) / hard.steepest, camera)
+        truth = reference_depth(lambda points, hard=hard: hard.sdf(points) / hard.lipschitz, camera)
         for strategy, config in STRATEGIES.items():
             with torch.no_grad():
                 buffers = render(hard.sdf, camera, config=config)

@@ -9,14 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from distrace.benchmarks.measuring import Operations, in_turn, poster_view, recorded
-from distrace.benchmarks.untrained import ball
+from distrace.benchmarks.measuring import in_turn, poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.movie import turntable
 from distrace.render import STRATEGIES, Buffers, render
+from experiments.costs.counting import Operations, recorded
+from experiments.fields.untrained import ball
 
 BOTH = ("fast", "coarse_to_fine")
 MEASURED = (1024, 2048, 4096)  # pixels along each side, for which memory is measured

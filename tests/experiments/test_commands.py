@@ -19,6 +19,7 @@ from distrace.mesh import MeshConfig
 from experiments.__main__ import main
 from experiments.commands import depth
 from experiments.datasets.splits import FOLDER
+from experiments.fields.analytic import NAMES
 from experiments.tables import completion, sparse_depth, spread, training_choices
 
 __all__ = ["model", "observation", "place", "run_distrace"]  # fixtures
@@ -144,6 +145,16 @@ def test_spread_correlates_spread_and_error(
     run("spread", "--classes", split, "--models", model, "--meshes", meshes, "--jobs", 1, "--out", tmp_path)
     (row,) = result(tmp_path, "rows", "median_correlation")["rows"]
     assert -1 <= row["correlation"] <= 1
+
+
+def test_views_measures_analytic_fields_alone_where_no_model_is_named(
+    run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    run("views", "--views", 1, "--sizes", 16, 16, "--out", tmp_path)
+    assert [row["model"] for row in result(tmp_path, "rows")["rows"]] == list(NAMES)
+    said = capsys.readouterr().out
+    for line in result(tmp_path, "summary")["summary"]:
+        assert any(text.startswith(line["model"]) and text.endswith(line["bar"]) for text in said.splitlines()), line
 
 
 def test_splits_and_card_describe_what_a_model_was_trained_on(
