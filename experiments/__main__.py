@@ -4,6 +4,7 @@ from distrace.cli import run_commands
 from experiments.commands.clip import Clip
 from experiments.commands.costs import Fields, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
+from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
 from experiments.commands.procedural import Procedural
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
@@ -26,6 +27,7 @@ COMMANDS = {
     "pose": Pose,
     "multiview": Multiview,
     "photographs": Photographs,
+    "foreign-models": ForeignModels,
     "splits": Splits,
     "choices": Choices,
     "card": Card,
