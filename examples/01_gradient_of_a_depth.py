@@ -20,9 +20,7 @@ buffers = dt.render(model.field(code), camera)
 target = buffers.depth.detach() - 0.01  # the sofa, a little closer to the camera
 loss = (buffers.depth - target)[buffers.mask].abs().mean()
 loss.backward(retain_graph=True)
-print(
-    f"{buffers.mask.sum()} pixels, {buffers.trace.total_evaluations} evaluations, |dL/dcode| = {code.grad.norm():.3f}"
-)
+print(f"{buffers.mask.sum()} pixels, {buffers.trace.total_evaluations} evaluations, |dL/dcode| {code.grad.norm():.3f}")
 
 step = 1e-3 * code.grad / code.grad.norm()
 with torch.no_grad():

@@ -1,7 +1,7 @@
 """Models that other people trained, rendered or refused: `pip download --no-deps deepsdfstruct` holds some.
 
-These decoders fill the cube [-1, 1]³, so their fields are cut to it. Some decode mirrored tiles, with a code that varies
-over space.
+These decoders fill the cube [-1, 1]³, so their fields are cut to it. Some decode mirrored tiles, with a code that
+varies over space.
 """
 
 import json
