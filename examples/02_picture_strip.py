@@ -17,7 +17,8 @@ model = dt.load_model(name)
 originals = [number for number, shape in enumerate(model.shapes) if "~" not in shape]  # no mirrored or warped copies
 camera = dt.Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=256, width=256)
 camera = camera.cropped(40, 0, 176, 256)
-shaded, normals = [], []
+shaded = []
+normals = []
 with torch.no_grad():
     for number in originals[:: max(len(originals) // 5, 1)][:5]:
         buffers = dt.render(model.field(number), camera)

@@ -87,7 +87,7 @@ def test_held_out_tells_a_model_all_distances(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     split, meshes = spheres_split
-    monkeypatch.setattr(completion, "TOLD", 4000)
+    monkeypatch.setattr(completion, "SAMPLES", 4000)
     monkeypatch.setattr(metrics, "POINTS", 2000)
     where = ("--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
     run("held-out", *where)
@@ -184,8 +184,8 @@ def test_choices_trains_small_networks(
         "sample", meshes, "--split", split, "--variants", 1, "--count", 1500, "--workers", 1, "--out", tmp_path / "s"
     )
     monkeypatch.setattr(training_choices, "SPECS", SPECS)
-    monkeypatch.setattr(completion, "TOLD", 500)
-    monkeypatch.setattr(completion, "TOLD_FIT", replace(completion.TOLD_FIT, iterations=4))
+    monkeypatch.setattr(completion, "SAMPLES", 500)
+    monkeypatch.setattr(completion, "SAMPLES_FIT", replace(completion.SAMPLES_FIT, iterations=4))
     monkeypatch.setattr(metrics, "POINTS", 500)
     where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
     run("choices", *where, "--others", tmp_path / "s", "--steps", 40, "--resolution", 24)
