@@ -34,7 +34,7 @@ COMMANDS = {
     "clip": Clip,
     "procedural": Procedural,
 }
-ABOUT = "Measure what distrace can do, and make what it is measured on. Results go to the folder --out."
+ABOUT = "Experiments and training data of distrace. Results go to the folder --out."
 
 
 def main() -> None:

@@ -192,7 +192,7 @@ def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, st
     """Returns each class with its model. Raises `ValueError` for more or fewer models than classes."""
     models = models or classes
     if not classes:
-        raise ValueError(f"--classes names none; give some of {', '.join(CLASSES)}, or CSV files")
+        raise ValueError(f"--classes names none; choose from {', '.join(CLASSES)}, or give CSV files")
     if len(models) != len(classes):
         given = f"{len(models)} models ({', '.join(models)}) were given"
         raise ValueError(f"{given} for {len(classes)} classes ({', '.join(classes)}); give one each")

@@ -1,4 +1,4 @@
-"""Models that other people trained, rendered or refused: `pip download --no-deps deepsdfstruct` holds some.
+"""Models that other people trained, rendered or refused, such as those of `pip download --no-deps deepsdfstruct`.
 
 These decoders fill the cube [-1, 1]³, so their fields are cut to it. Some decode mirrored tiles, with a code that
 varies over space.

@@ -60,7 +60,7 @@ class Choices:
 
 @dataclass(frozen=True)
 class Card:
-    """Make a model card: pictures of each shape beside the true one, walks between codes, and the table of shapes."""
+    """Make a model card: pictures of each shape next to the true one, walks between codes, and the table of shapes."""
 
     model: ModelName = "sofas"
     split: str | None = None  # by default that of the model's name

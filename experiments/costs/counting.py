@@ -1,4 +1,4 @@
-"""Counts what a rendering asks of PyTorch and of the network."""
+"""Counts PyTorch's operations and the calls of the network."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager

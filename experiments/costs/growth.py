@@ -134,7 +134,7 @@ def _peak(model: str, code: int, size: int) -> float:
     return _memory("VmHWM") - before
 
 
-def _memory(what: str) -> float:
+def _memory(name: str) -> float:
     """Returns a value of Linux's `/proc/self/status`, in MiB."""
     lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(lines[what].split()[0]) / 1024
+    return int(lines[name].split()[0]) / 1024

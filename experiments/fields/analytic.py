@@ -1,4 +1,4 @@
-"""Fields that break what sphere tracing assumes: steep, saturated, clamped, thin, tiny, and seen from within."""
+"""Fields that break what sphere tracing assumes: steep, saturated, clamped, thin, tiny, and around the camera."""
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
@@ -35,7 +35,7 @@ class HardField(NamedTuple):
 
 
 class Drawn(NamedTuple):
-    """A field, the camera that looks at it, and the field's Lipschitz constant."""
+    """A field, its camera, and the field's Lipschitz constant."""
 
     sdf: SDF
     shot: Shot

@@ -16,7 +16,7 @@ from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers
 
 OUTLIER = 1e-3  # radii: a depth with a larger error is an outlier
-LONG = 60.0  # seconds; what takes longer runs once
+LONG = 60.0  # seconds; a longer run is not repeated
 SMALLEST_STEP = 5e-5  # radii
 LARGEST_STEP = 0.02  # radii
 

@@ -12,7 +12,7 @@ def derivatives(images: Callable[[Tensor], Images], like: Tensor) -> Images:
     """Returns d images / dh at h = 0 for every pixel, by autograd; zero for an image that does not depend on h.
 
     `like` gives dtype and device of h. Two reverse passes make a forward pass: the product with a cotangent u is
-    linear in u, and its derivative by u is the derivative by h (Townsend, *A new trick for calculating Jacobian vector
+    linear in u. Its derivative by u is the derivative by h (Townsend, *A new trick for calculating Jacobian vector
     products*, 2017).
     """
     h = like.new_zeros(()).requires_grad_()

@@ -1,7 +1,7 @@
 """Ways to change a field or its camera by one number h, along which derivatives are checked.
 
-h has no unit. h = 1 turns by a radian, shifts by the radius of the unit sphere, doubles a focal length, shifts the
-principal point by the image's width, and changes a code or weights by their own norm.
+h has no unit. h = 1 turns by a radian, shifts by the radius of the unit sphere, or doubles a focal length. It shifts
+the principal point by the image's width, and changes a code or weights by their own norm.
 """
 
 from collections.abc import Callable, Mapping
