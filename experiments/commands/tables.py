@@ -116,7 +116,7 @@ def _collect(run: Run, name: str, model: str, results: Iterable[Result], count: 
 
 def _save(run: Run, name: str, model: str, results: list[Result]) -> None:
     if not results:
-        raise ValueError(f"{model} and the split share no shape for {name}; give a --split that does")
+        raise ValueError(f"{model} and the split have no shape in common for {name}; give a --split that has one")
     rows = [result.row(model) for result in results]
     totals = summary(results)
     show_table(rows)
