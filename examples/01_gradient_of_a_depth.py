@@ -1,8 +1,8 @@
-"""Render a sofa, and ask what its depth would have to do for the sofa to stand a little nearer.
+"""Renders a bundled sofa, and prints the gradient of a loss on its depth by the shape's code.
 
     python examples/01_gradient_of_a_depth.py [OUT.png]
 
-The same lines as in the README. The gradient is exact: its last line compares it with a finite difference.
+The lines up to `print` are the README's. The last line compares a derivative with a finite difference.
 """
 
 import sys
@@ -17,21 +17,19 @@ model = dt.load_model("sofas")
 code = model.codes[0].clone().requires_grad_()
 camera = dt.Camera.orbit(azimuth=30, elevation=20, distance=4.97, focal_mm=60, sensor_mm=32, height=256, width=256)
 buffers = dt.render(model.field(code), camera)
-seen = buffers.mask
-target = buffers.depth.detach() - 0.01
-loss = (buffers.depth - target)[seen].abs().mean()
-loss.backward()
-print(
-    seen.sum().item(), "pixels,", buffers.trace.total_evaluations, "evaluations, |dL/dcode| =", code.grad.norm().item()
-)
+target = buffers.depth.detach() - 0.01  # the sofa, a little closer to the camera
+loss = (buffers.depth - target)[buffers.mask].abs().mean()
+loss.backward(retain_graph=True)
+print(f"{buffers.mask.sum()} pixels, {buffers.trace.total_evaluations} evaluations, |dL/dcode| {code.grad.norm():.3f}")
 
-direction = 1e-3 * code.grad / code.grad.norm()
+step = 1e-3 * code.grad / code.grad.norm()
 with torch.no_grad():
-    far, near = (dt.render(model.field(code + sign * direction), camera).depth for sign in (1, -1))
-change = (far - near) / 2
-smooth = change.abs() < 0.01  # an outline that moved across a pixel is no derivative of its depth
-expected = torch.autograd.grad(dt.render(model.field(code), camera).depth[smooth].mean(), code)[0] @ direction
-print("along the gradient:", expected.item(), "finite difference:", change[smooth].mean().item())
+    after = dt.render(model.field(code + step), camera).depth
+    before = dt.render(model.field(code - step), camera).depth
+difference = (after - before) / 2
+smooth = difference.abs() < 0.01  # excludes pixels that an outline crosses
+derivative = torch.autograd.grad(buffers.depth[smooth].mean(), code)[0] @ step
+print("derivative:", derivative.item(), "finite difference:", difference[smooth].mean().item())
 
 images = [
     shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions),

@@ -1,8 +1,8 @@
-"""A trained experiment folder in the small form that is bundled: weight norm multiplied out, in half precision.
+"""Writes a trained model in the small form of the bundled ones: half precision, with weight norm multiplied out.
 
     python examples/05_bundle_a_model.py EXPERIMENT OUT
 
-and how far the small form is from the large one, on one view.
+The last line compares both forms on one view.
 """
 
 import sys
@@ -11,16 +11,16 @@ from pathlib import Path
 import torch
 
 import distrace as dt
-from distrace.benchmarks.measuring import poster_view
-from distrace.checkpoints.model import save_model
 from distrace.metrics import depth_errors, iou
 
 experiment, out = (Path(argument) for argument in sys.argv[1:3])
 large = dt.load_model(experiment)
-save_model(out, large)
+dt.save_model(out, large)
 small = dt.load_model(out)
+camera = dt.Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=256, width=256)
 with torch.no_grad():
-    before, after = (dt.render(model.field(0), poster_view()) for model in (large, small))
-errors = depth_errors(before.depth, after.depth)
+    first = dt.render(large.field(0), camera)
+    second = dt.render(small.field(0), camera)
+errors = depth_errors(first.depth, second.depth)
 size = (out / "model.safetensors").stat().st_size / 1e6
-print(f"{size:.1f} MB; IoU {iou(before.mask, after.mask):.5f}, depth off by {errors.mean():.1e} in the mean")
+print(f"{size:.1f} MB; IoU {iou(first.mask, second.mask):.5f}, mean error of depth {errors.mean():.1e}")

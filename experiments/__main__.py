@@ -4,12 +4,15 @@ from distrace.cli import run_commands
 from experiments.commands.clip import Clip
 from experiments.commands.costs import Fields, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
+from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
 from experiments.commands.procedural import Procedural
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
 from experiments.commands.training_data import Card, Choices, Splits
+from experiments.commands.views import Views
 
 COMMANDS = {
+    "views": Views,
     "fields": Fields,
     "growth": Growth,
     "memory": Memory,
@@ -24,13 +27,14 @@ COMMANDS = {
     "pose": Pose,
     "multiview": Multiview,
     "photographs": Photographs,
+    "foreign-models": ForeignModels,
     "splits": Splits,
     "choices": Choices,
     "card": Card,
     "clip": Clip,
     "procedural": Procedural,
 }
-ABOUT = "Measure what distrace can do, and make what it is measured on. Results go to the folder --out."
+ABOUT = "Experiments and training data of distrace. Results go to the folder --out."
 
 
 def main() -> None:

@@ -1,7 +1,7 @@
 """An untrained decoder whose shapes are bumpy balls, for tests of fitting."""
 
-from distrace.benchmarks.untrained import ball_decoder
 from distrace.fields.decoder import Decoder, NetworkSpecs
+from experiments.fields.untrained import ball_decoder
 
 
 def bumpy_balls(radius: float = 0.6) -> Decoder:

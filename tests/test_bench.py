@@ -5,14 +5,13 @@ from dataclasses import asdict
 
 import pytest
 import torch
-from torch import Tensor
+from spheres import Spheres
 
 from distrace.benchmarks.ablation import COUNT, NAIVE_RAYS, of_field, of_model
 from distrace.benchmarks.measuring import LONG, Case, Row, in_turn, measure, poster_view, reference_distance
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.fields.base import SDF, Counted
-from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.fields.base import Counted
 from distrace.fields.primitives import box, capsule, sphere, union
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import STRATEGIES, Buffers, render
@@ -121,21 +120,8 @@ def test_queries_are_all_that_the_field_was_asked_for() -> None:
         assert (trace.setup_evaluations > 0) == (case.strategy in ("coarse_to_fine", "fast"))
 
 
-class Spheres(Decoder):
-    """The code is the radius, and something that changes nothing."""
-
-    def __init__(self) -> None:
-        super().__init__(NetworkSpecs(dims=(8,), code_length=2, latent_in=(), norm_layers=()))
-
-    def field(self, code: Tensor) -> SDF:
-        return sphere(code[0])
-
-    def forward(self, points: Tensor, code: Tensor) -> Tensor:
-        return points.norm(dim=-1) - code[..., 0]
-
-
 def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() -> None:
-    spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 1.0]]), ("ball",))
+    spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 0.0, 0.0, 0.0]]), ("ball",))
     rows = {row.strategy: row for row, _ in measure(of_model(spheres, 0, poster_view(48)), repeats=1)}
     assert len(rows) == COUNT
     entering = int(meet_sphere(poster_view(48).rays()).meets.sum())

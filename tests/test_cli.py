@@ -16,7 +16,6 @@ from test_train import SPECS, of_sphere, spheres
 import distrace.cli
 import distrace.cli.train_samples
 import distrace.movie
-from distrace.benchmarks.analytic import NAMES
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import show
@@ -339,16 +338,6 @@ def test_bench_views_writes_rows_a_summary_and_the_worst_views(model: Path, run:
     assert {row["strategy"] for row in again["rows"]} == {"dynamic"}
     for key in ("code", "camera", "pixels"):
         assert [row[key] for row in again["rows"]] == [row[key] for row in facts["rows"]], key
-
-
-def test_bench_views_measures_analytic_fields_alone_where_no_model_is_named(
-    run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
-) -> None:
-    run("bench", "views", "--fields", "--views", 1, "--sizes", 16, 16, "--out", tmp_path)
-    assert [row["model"] for row in result(tmp_path, "rows")["rows"]] == list(NAMES)
-    said = capsys.readouterr().out
-    for line in result(tmp_path, "summary")["summary"]:
-        assert any(text.startswith(line["model"]) and text.endswith(line["bar"]) for text in said.splitlines()), line
 
 
 def test_without_a_command_or_with_help_it_says_what_there_is(run: Command, capsys: pytest.CaptureFixture) -> None:

@@ -12,9 +12,9 @@ import torch
 import distrace.cli
 import distrace.cli.gradients
 from distrace.benchmarks.derivatives import COUNT
-from distrace.benchmarks.untrained import ball
 from distrace.checking.gradcheck import GradientCheck, GradientRow, check_gradients
 from distrace.checkpoints.model import save_experiment
+from experiments.fields.untrained import ball
 
 VIEW = ("--distance", "3", "--focal-mm", "40", "--size", "10")
 COMMON = {"seconds", "device", "version", "evaluations", "rows", "command", "machine"}

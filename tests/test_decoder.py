@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch.func import functional_call
 
-from distrace.benchmarks.measuring import Operations
 from distrace.fields.base import chunked
 from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
+from experiments.costs.counting import Operations
 
 torch.set_num_threads(1)
 

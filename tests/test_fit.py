@@ -6,12 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from spheres import Spheres
 from torch import Tensor
 
 from distrace import losses
 from distrace.camera import Camera
 from distrace.data.observation import View
-from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.fields.primitives import sphere
 from distrace.fitting.fit import FitConfig, fit_shape, view_terms
 from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples
@@ -25,16 +25,6 @@ CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 TRUE = torch.tensor([0.45, 0.1, -0.15, 0.05])
 PRIOR = Prior(torch.tensor([0.3, 0.0, 0.0, 0.0]), torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1])))
 CONFIG = FitConfig(iterations=120, learning_rate=0.1, starts=1, mask_rays=200)
-
-
-class Spheres(Decoder):
-    """The code is the radius and the centre."""
-
-    def __init__(self) -> None:
-        super().__init__(NetworkSpecs(dims=(8,), code_length=4, latent_in=(), norm_layers=()))
-
-    def field(self, code: Tensor):
-        return sphere(code[0], code[1:])
 
 
 def view_of(code: Tensor, camera: Camera = CAMERA, *, mask: bool = True, normal: bool = False) -> View:

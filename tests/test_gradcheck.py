@@ -11,7 +11,7 @@ from distrace.checking.differences import derivatives, differences
 from distrace.checking.footprints import Footprints
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, check_gradients, compare
 from distrace.checking.moves import all_moves, decoder_changes, in_double, own_changes
-from distrace.checking.retrace import DOUBLE, SINGLE, Retraced, least_beside, zero_beside
+from distrace.checking.retrace import DOUBLE, SINGLE, Retraced, minimum_near, root_near
 from distrace.checkpoints.model import load_model
 from distrace.fields import primitives
 from distrace.fields.decoder import Decoder, NetworkSpecs
@@ -265,7 +265,7 @@ def test_the_footprint_normals_of_bundled_decoders_follow_differences_to_a_tenth
     tried = {"camera rotation": "y", "camera translation": "x", "focal length": "", "principal point": "y", "code": ""}
     errors = []
     for parameter, along in tried.items():
-        found = footprints.both(moves[parameter][along], footprints.step(parameter == "code"))
+        found = footprints.slopes(moves[parameter][along], footprints.step(parameter == "code"))
         compared = compare(along, *found, None, DOUBLE)
         assert (~compared.error.isnan()).sum() > 20
         assert compared.difference.norm(dim=-1).nanmedian() > 1e-3
@@ -293,7 +293,7 @@ def test_derivatives_are_those_of_every_element_and_zero_where_there_is_no_way()
     assert derivatives(lambda h: {"none": x}, like)["none"].eq(0).all()
 
 
-def test_the_zero_beside_a_hit_is_found_or_none_is_claimed() -> None:
+def test_the_root_near_a_hit_is_found_or_none_is_claimed() -> None:
     rays = CAMERA.rays()[8:9, 8:9].flat()
     rays = type(rays)(rays.origins.double(), rays.directions.double())
     rays = type(rays)(rays.origins, rays.directions / rays.directions.norm(dim=-1, keepdim=True))
@@ -301,9 +301,9 @@ def test_the_zero_beside_a_hit_is_found_or_none_is_claimed() -> None:
     away = (rays.origins.square().sum(-1) - middle**2).sqrt()
     exact = middle - (0.25 - away**2).sqrt()
     slope = (rays.at(exact) * rays.directions).sum(-1) / 0.5
-    torch.testing.assert_close(zero_beside(primitives.sphere(0.5), rays, exact + 1e-6, slope, 1e-11), exact)
-    assert zero_beside(lambda p: p.norm(dim=-1) + 1, rays, exact, slope, 1e-11).isnan().all()
-    torch.testing.assert_close(least_beside(primitives.sphere(away - 0.1), rays, middle + 1e-5, 5e-5), away * 0 + 0.1)
+    torch.testing.assert_close(root_near(primitives.sphere(0.5), rays, exact + 1e-6, slope, 1e-11), exact)
+    assert root_near(lambda p: p.norm(dim=-1) + 1, rays, exact, slope, 1e-11).isnan().all()
+    torch.testing.assert_close(minimum_near(primitives.sphere(away - 0.1), rays, middle + 1e-5, 5e-5), away * 0 + 0.1)
 
 
 def test_the_least_value_at_a_corner_is_between_all_samples() -> None:
@@ -311,5 +311,5 @@ def test_the_least_value_at_a_corner_is_between_all_samples() -> None:
     rays = CAMERA.rays()[0, :1]
     rays = type(rays)(torch.zeros(1, 3, dtype=torch.float64), torch.tensor([[1.0, 0, 0]], dtype=torch.float64))
     corner = lambda p: 1 + torch.where(p[..., 0] > 0.5, p[..., 0] - 0.5, 0.3 * (0.5 - p[..., 0]))  # noqa: E731
-    found = least_beside(corner, rays, torch.tensor([0.50003], dtype=torch.float64), 5e-5)
+    found = minimum_near(corner, rays, torch.tensor([0.50003], dtype=torch.float64), 5e-5)
     assert found.item() == pytest.approx(1, abs=1e-14)

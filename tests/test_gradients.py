@@ -9,7 +9,6 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace.benchmarks.derivatives import COUNT, QUERIES, RatioRow, ratio_rows, subjects
-from distrace.benchmarks.untrained import ball
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives
 from distrace.checking.gradcheck import check_gradients
@@ -18,6 +17,7 @@ from distrace.checking.retrace import DOUBLE, Retraced
 from distrace.checkpoints.model import Model
 from distrace.fields import primitives
 from distrace.fields.base import SDF
+from experiments.fields.untrained import ball
 
 f64 = torch.float64
 RADIUS, CENTRE = 0.5, torch.tensor([0.1, -0.05, 0.2], dtype=f64)
@@ -220,7 +220,7 @@ def test_rays_of_a_moved_camera_are_those_that_are_compared() -> None:
     view = Retraced.of(sdf, VIEW, 1.0, DOUBLE)
     nearer = replace(VIEW, T_world_camera=VIEW.T_world_camera.clone())
     nearer.T_world_camera[:3, 3] *= 1 - 1e-7
-    moved, here = view.traced_anew(sdf, nearer), view.traced_anew(sdf, VIEW)
+    moved, here = view.retraced(sdf, nearer), view.retraced(sdf, VIEW)
     assert (moved["distance"] < here["distance"]).all()
     exact = of_sphere(nearer, CENTRE, CENTRE.new_tensor(RADIUS), view.trace.hit)
     for name, image in exact.items():

@@ -53,5 +53,18 @@ def test_imports_go_downward_and_nothing_imports_the_shell(name: str) -> None:
     assert imported(name) <= allowed
 
 
+def test_nothing_imports_the_experiments() -> None:
+    modules = {name for tree in TREES.values() for node in ast.walk(tree) for name in modules_of(node)}
+    assert "torch" in modules
+    assert "experiments" not in modules
+
+
+def modules_of(node: ast.AST) -> set[str]:
+    """The top-level modules that a statement imports."""
+    if isinstance(node, ast.Import):
+        return {alias.name.split(".")[0] for alias in node.names}
+    return {node.module.split(".")[0]} if isinstance(node, ast.ImportFrom) and node.module else set()
+
+
 def test_only_the_command_line_prints() -> None:
     assert [name for name in TREES if prints(name) and name.split("/")[0] != "cli"] == []

@@ -8,7 +8,7 @@ import torch
 from bumpy import bumpy_balls
 from torch import Tensor
 
-from distrace.benchmarks.measuring import Operations, poster_view, recorded, reference_distance
+from distrace.benchmarks.measuring import poster_view, reference_distance
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model
 from distrace.errors import DoubtfulResult
@@ -23,6 +23,7 @@ from distrace.tracing.images import BRANCH, Pixels, reach
 from distrace.tracing.march import march_cones
 from distrace.tracing.sphere_tracing import Outcome
 from distrace.tracing.tracer import TracerConfig, trace_rays
+from experiments.costs.counting import Operations, recorded
 
 f64 = torch.float64
 P = primitives

@@ -1,1 +1,1 @@
-"""What others would do."""
+"""Baselines."""

@@ -1,1 +1,1 @@
-"""Images of held-out shapes from all around, by an independent renderer."""
+"""Clips around held-out shapes, by an independent renderer."""

@@ -1,7 +1,7 @@
-"""A synthetic clip: what is filmed, from where, and the folder that it is kept in.
+"""A synthetic clip: its description, its cameras, and its folder.
 
-The folder holds `clip.json` (what it was made from, written first), `images/`, `truth/masks/` and `truth/depth/`, and
-`views.json` (cameras, written last). Whatever of it is there is whole, so that a stopped run goes on where it was.
+The folder holds `clip.json` (the description, written first), `images/`, `truth/masks/`, `truth/depth/`, and
+`views.json` (cameras, written last). Each file is written whole, so a stopped run can resume.
 """
 
 import json
@@ -24,16 +24,19 @@ from distrace.shading import Picture, save_png
 from experiments.datasets.splits import on_side
 
 Background = Literal["plain", "cluttered"]
-Texture = Literal["own", "procedural"]  # of the mesh's maker; or a noise of ours over its plain colours
-FOCAL_MM, SENSOR_MM, DISTANCE = 60.0, 32.0, 4.97  # all of the unit sphere is in view
-LOWEST, HIGHEST = 10.0, 35.0  # degrees of elevation that the camera sways between
-SWAYS = 2  # per turn
+Texture = Literal["own", "procedural"]  # the mesh's images; or noise over its colours
+FOCAL_MM = 60.0
+SENSOR_MM = 32.0
+DISTANCE = 4.97  # from which the whole unit sphere is in view
+LOWEST = 10.0  # degrees of elevation
+HIGHEST = 35.0
+SWAYS = 2  # of the elevation per turn
 LEAST_SIZE = 16
 
 
 @dataclass(frozen=True)
 class Clip:
-    """All that the images depend on, and whose mesh it is."""
+    """Everything that the images depend on, and the mesh's creator and licence."""
 
     shape: str
     split: str
@@ -46,14 +49,14 @@ class Clip:
     creator: str
     licence: str
     mitsuba: str
-    seed: int = field(init=False)  # of noise and clutter: by the shape's name
+    seed: int = field(init=False)  # of noise and clutter, a hash of the shape's name
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "seed", zlib.crc32(self.shape.encode()))
 
     @property
     def cameras(self) -> list[Camera]:
-        """Once around the shape, in equal steps of azimuth."""
+        """Returns cameras once around the shape, in equal steps of azimuth."""
         return [self._camera(frame / self.frames) for frame in range(self.frames)]
 
     def _camera(self, turn: float) -> Camera:
@@ -63,7 +66,7 @@ class Clip:
 
 
 def held_out(split: str, name: str) -> Shape:
-    """Raises `ValueError`, with the names there are, where the split holds out no shape of that name."""
+    """Returns a held-out shape. Raises `ValueError`, with the valid names, for another name."""
     shapes = on_side("test", split)
     for shape in shapes:
         if shape.name == name:
@@ -73,7 +76,7 @@ def held_out(split: str, name: str) -> Shape:
 
 
 def check(frames: int, size: int, samples: int) -> None:
-    """Raises `ValueError` for what makes no clip."""
+    """Raises `ValueError` for numbers that make no clip."""
     if frames < 2:
         raise ValueError(f"--frames {frames} was given; a clip has at least 2")
     if size < LEAST_SIZE:
@@ -88,14 +91,14 @@ def begin(folder: Path, clip: Clip) -> None:
     if not path.exists():
         return save_json(path, asdict(clip))
     with explained(f"{path} cannot be read; move it or choose another --out"):
-        kept = dict(json.loads(path.read_text(encoding="utf-8")))
-    other = [f"{name} {kept.get(name)}" for name, value in asdict(clip).items() if kept.get(name) != value]
-    if other:
-        raise ValueError(f"{folder} holds another clip ({', '.join(other)}); choose another --out")
+        content = dict(json.loads(path.read_text(encoding="utf-8")))
+    different = [f"{name} {content.get(name)}" for name, value in asdict(clip).items() if content.get(name) != value]
+    if different:
+        raise ValueError(f"{folder} holds another clip ({', '.join(different)}); choose another --out")
 
 
 def missing(folder: Path, clip: Clip) -> list[int]:
-    """The frames that are still to be rendered; a frame's image is written after its truth."""
+    """Returns the frames without an image; a frame's image is written after its truth."""
     return [frame for frame in range(clip.frames) if not (folder / image_name(frame)).is_file()]
 
 
@@ -110,7 +113,7 @@ def save_frame(
     mask: Bool[np.ndarray, "height width"],
     depth: Float[np.ndarray, "height width"],
 ) -> None:
-    """The image, and in `truth/` the mask (255 is the shape) and the depth z in float32, `inf` where nothing is."""
+    """Writes the image, and in `truth/` the mask (255 is the shape) and the depth z, `inf` on the background."""
     with written(folder / f"truth/depth/{frame:03d}.npy") as file:
         np.save(file, depth)
     save_mask(folder / f"truth/masks/{frame:03d}.png", torch.from_numpy(mask))
@@ -118,7 +121,7 @@ def save_frame(
 
 
 def save_views(folder: Path, clip: Clip) -> None:
-    """`views.json`: each image with its camera, and the sphere that the shape is in. A second call writes nothing."""
+    """Writes `views.json`, each image with its camera and the unit sphere, unless it exists."""
     views = [
         {
             "image": image_name(frame),

@@ -1,4 +1,4 @@
-"""Surroundings of an object: coloured boxes beyond the cameras' orbit, and a patterned sky behind them."""
+"""A cluttered background: coloured boxes beyond the cameras' orbit, and a patterned sky behind them."""
 
 import numpy as np
 import trimesh
@@ -7,13 +7,14 @@ from jaxtyping import Float, UInt8
 from experiments.clips.patches import Patch
 
 BOXES = 260
-NEAREST, FARTHEST = 7.0, 11.0  # from the origin; cameras are at about 5
-SIZES = (0.5, 2.0)  # of their edges
-ELEVATIONS = (-75.0, 25.0)  # degrees: where cameras above the equator look to
+NEAREST = 7.0  # radii from the origin; cameras are at about 5
+FARTHEST = 11.0
+SIZES = (0.5, 2.0)  # of the edges, in radii
+ELEVATIONS = (-75.0, 25.0)  # degrees: the background of cameras above the equator
 
 
 def boxes(seed: int) -> Patch:
-    """Boxes at random, each face in a colour of its own."""
+    """Returns random boxes; each face has a colour of its own."""
     random = np.random.default_rng(seed)
     corners = np.concatenate([_box(random) for _ in range(BOXES)])
     colours = random.uniform(0.3, 1.0, (len(corners) // 2, 3)).repeat(2, axis=0)  # a face is two triangles
@@ -22,7 +23,8 @@ def boxes(seed: int) -> Patch:
 
 def _box(random: np.random.Generator) -> Float[np.ndarray, "12 3 3"]:
     sines = np.sin(np.radians(ELEVATIONS))
-    azimuth, sine = random.uniform(0, 2 * np.pi), random.uniform(*sines)
+    azimuth = random.uniform(0, 2 * np.pi)
+    sine = random.uniform(*sines)
     level = np.sqrt(1 - sine**2)
     place = random.uniform(NEAREST, FARTHEST) * np.array([np.sin(azimuth) * level, sine, np.cos(azimuth) * level])
     rotation = np.linalg.qr(random.normal(size=(3, 3)))[0]
@@ -32,7 +34,7 @@ def _box(random: np.random.Generator) -> Float[np.ndarray, "12 3 3"]:
 
 
 def sky(seed: int, height: int = 256) -> UInt8[np.ndarray, "height width 3"]:
-    """A panorama, twice as wide as high: rectangles one over another, bright in the mean."""
+    """Returns a bright panorama of overlapping rectangles, twice as wide as high."""
     random = np.random.default_rng(seed)
     image = np.full((height, 2 * height, 3), 180, np.uint8)
     for _ in range(500):

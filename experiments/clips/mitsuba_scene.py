@@ -1,4 +1,4 @@
-"""Photographs of patches by Mitsuba 3, a path tracer that shares nothing with the renderer here (Jakob et al. 2022)."""
+"""Photographs of patches by Mitsuba 3, a path tracer independent of this renderer (Jakob et al. 2022)."""
 
 import importlib
 from collections.abc import Sequence
@@ -13,15 +13,16 @@ from distrace.shading import Picture
 from experiments.clips import clutter
 from experiments.clips.patches import Patch
 
-BRIGHTNESS = 0.42  # radiance of the surroundings: a white sheet lit by them alone is this bright
-LAMP_RADIANCE, LAMP_EDGE = 6.0, 3.0
-LAMP_PLACE = (2.6, 5.2, 3.0)  # fixed in the world, beyond the cameras' orbit and above what they see
+BRIGHTNESS = 0.42  # radiance of the surroundings
+LAMP_RADIANCE = 6.0
+LAMP_EDGE = 3.0  # radii
+LAMP_PLACE = (2.6, 5.2, 3.0)  # in the world, beyond the cameras' orbit and above their images
 BOUNCES = 3
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's cameras have x to the left and y up
 
 
 def mitsuba() -> Any:
-    """The library, in the variant that needs no compiler. Raises `ValueError` where it is not installed."""
+    """Imports Mitsuba, in the variant that needs no compiler. Raises `ValueError` where it is not installed."""
     try:
         library = importlib.import_module("mitsuba")
     except ImportError as error:
@@ -34,14 +35,14 @@ def mitsuba() -> Any:
 
 @dataclass(frozen=True)
 class Stage:
-    """The shape alone, for its true mask and depth; and the shape as it is photographed."""
+    """The shape alone, for its true mask and depth, and the lit scene."""
 
     alone: dict[str, Any]
     lit: dict[str, Any]
 
 
 def staged(patches: Sequence[Patch], background: str, seed: int) -> Stage:
-    """The patches in the light of a lamp and of their surroundings: a grey, or a cluttered hall."""
+    """Returns the patches in the light of a lamp and of their surroundings, grey or cluttered."""
     mi = mitsuba()
     alone = {f"patch{index}": _mesh(mi, patch) for index, patch in enumerate(patches)}
     around = {"grey": _grey()} if background == "plain" else _hall(mi, seed)
@@ -49,7 +50,7 @@ def staged(patches: Sequence[Patch], background: str, seed: int) -> Stage:
 
 
 def photograph(stage: Stage, camera: Camera, samples: int, seed: int) -> Picture:
-    """An image in 8-bit sRGB."""
+    """Renders an image in 8-bit sRGB."""
     mi = mitsuba()
     sampler = {"type": "independent", "sample_count": samples}
     scene = mi.load_dict({**stage.lit, "sensor": _sensor(mi, camera, sampler)})
@@ -59,19 +60,20 @@ def photograph(stage: Stage, camera: Camera, samples: int, seed: int) -> Picture
 
 
 def truth(stage: Stage, camera: Camera) -> tuple[Bool[np.ndarray, "height width"], Float[np.ndarray, "height width"]]:
-    """The mask of the shape at the pixels' centres, and its depth z, `inf` where it is not."""
+    """Renders the mask of the shape at the pixels' centres, and its depth z, `inf` on the background."""
     mi = mitsuba()
     sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
     scene = mi.load_dict({**stage.alone, "sensor": _sensor(mi, camera, sampler)})
     aovs = mi.load_dict({"type": "aov", "aovs": "distance:depth,point:position"})
     channels = np.array(mi.render(scene, integrator=aovs), np.float64)
-    mask, points = channels[..., -4] > 0, channels[..., -3:]
+    mask = channels[..., -4] > 0
+    points = channels[..., -3:]
     pose = camera.T_world_camera.double().numpy()
     return mask, np.where(mask, (points - pose[:3, 3]) @ pose[:3, 2], np.inf).astype(np.float32)
 
 
 def _sensor(mi: Any, camera: Camera, sampler: dict[str, Any]) -> dict[str, Any]:
-    """The camera; its optical axis meets the middle of its image."""
+    """Returns Mitsuba's camera; the principal point is the middle of the image."""
     focal = camera.intrinsics[0, 0].item()
     return {
         "type": "perspective",
@@ -91,10 +93,10 @@ def _sensor(mi: Any, camera: Camera, sampler: dict[str, Any]) -> dict[str, Any]:
 
 
 def _mesh(mi: Any, patch: Patch) -> Any:
-    """Both sides are matt; faces are flat, as the normals of files point either way."""
+    """Returns a matt, two-sided mesh with flat faces, since normals in files point either way."""
     properties = mi.Properties()
     properties["mesh_bsdf"] = mi.load_dict(
-        {"type": "twosided", "matt": {"type": "diffuse", "reflectance": _look(patch)}}
+        {"type": "twosided", "matt": {"type": "diffuse", "reflectance": _reflectance(patch)}}
     )
     count = len(patch.corners)
     mesh = mi.Mesh("patch", 3 * count, count, has_vertex_texcoords=True, props=properties)
@@ -107,14 +109,14 @@ def _mesh(mi: Any, patch: Patch) -> Any:
     return mesh
 
 
-def _look(patch: Patch) -> dict[str, Any]:
+def _reflectance(patch: Patch) -> dict[str, Any]:
     if patch.image is None:
         return {"type": "mesh_attribute", "name": "vertex_color"}
     return {"type": "bitmap", "bitmap": mitsuba().Bitmap(patch.image.copy()), "raw": False}
 
 
 def _linear(colours: Float[np.ndarray, "*colours 3"]) -> Float[np.ndarray, "*colours 3"]:
-    """From sRGB (IEC 61966-2-1)."""
+    """Converts from sRGB (IEC 61966-2-1)."""
     return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
 
 
@@ -132,12 +134,12 @@ def _lamp(mi: Any) -> dict[str, Any]:
 
 
 def _hall(mi: Any, seed: int) -> dict[str, Any]:
-    """Boxes under a sky that shines."""
+    """Returns boxes under a luminous sky."""
     sky = mi.Bitmap(_sky_radiance(clutter.sky(seed)))
     return {"boxes": _mesh(mi, clutter.boxes(seed)), "sky": {"type": "envmap", "bitmap": sky}}
 
 
 def _sky_radiance(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
-    """As bright in the mean as the plain surroundings."""
+    """Scales the sky to the mean radiance of the plain surroundings."""
     light = _linear(image / 255)
     return (light * BRIGHTNESS / light.mean()).astype(np.float32)

@@ -1,7 +1,7 @@
-"""Meshes with what they look like: images on them, or colours.
+"""Meshes with their appearance: images, or colours at their corners.
 
-What a mesh looks like is the file's own where images cover enough of it, else ours: a noise in space that modulates
-its plain colours, so that there is something to match between views.
+A mesh keeps its own images where they cover enough of it. Otherwise noise modulates its colours, so that views can be
+matched.
 """
 
 from collections.abc import Iterator, Sequence
@@ -19,19 +19,19 @@ from distrace.data.solid import bounding, normalised_frame, turn_matrix
 from distrace.errors import explained
 from experiments.clips.solid_texture import mottled
 
-ENOUGH = 0.25  # of the area under images that are not of one colour
-EDGE = 0.02  # triangles are split to this before they are coloured at their corners
-FAR = 1e4  # repetitions of an image: uv beyond are garbage, which Mitsuba's filter turns into infinite colours
+LEAST_TEXTURED = 0.25  # share of the area under images of more than one colour
+EDGE = 0.02  # radii: triangles are split to this before their corners are coloured
+LARGEST_UV = 1e4  # repetitions of an image; garbage beyond becomes infinite in Mitsuba's filter
 GREY = np.full(3, 0.6)
 
 
 @dataclass(frozen=True)
 class Patch:
-    """Triangles that look alike: in one colour, or with an image, or with a colour at each corner."""
+    """Triangles that share an appearance: an image, or a colour at each corner."""
 
     corners: Float[np.ndarray, "triangles 3 3"]
     uv: Float[np.ndarray, "triangles 3 2"]  # v up
-    colours: Float[np.ndarray, "triangles 3 3"]  # sRGB, 0 to 1; where there is no image
+    colours: Float[np.ndarray, "triangles 3 3"]  # sRGB, 0 to 1; used without an image
     image: UInt8[np.ndarray, "height width 3"] | None = None
 
     def chosen(self, triangles: Bool[np.ndarray, "triangles"]) -> "Patch":
@@ -43,30 +43,30 @@ class Patch:
 
 
 def load_patches(path: Path) -> list[Patch]:
-    """All triangles of a file, as they are. Raises `ValueError` for a file that cannot be read."""
+    """Returns all triangles of a file. Raises `ValueError` for a file that cannot be read."""
     with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file"):
         return _of_ac3d(path) if path.suffix.lower() == ".ac" else _of_trimesh(path)
 
 
 def has_images(patches: Sequence[Patch]) -> bool:
-    """Whether enough of a mesh is under images to tell its places apart by."""
-    own = sum(patch.area for patch in patches if patch.image is not None)
-    return bool(own > ENOUGH * sum(patch.area for patch in patches))
+    """Whether images cover enough of a mesh to match views."""
+    textured = sum(patch.area for patch in patches if patch.image is not None)
+    return bool(textured > LEAST_TEXTURED * sum(patch.area for patch in patches))
 
 
 def placed(patches: Sequence[Patch], degrees: float) -> list[Patch]:
-    """In the frame of `solid_of`: centred, scaled and turned alike. What bounds nothing of the solid is left out."""
+    """Returns the patches in the frame of `solid_of`, without the triangles that bound nothing of the solid."""
     middle, scale = normalised_frame(_soup(patches))
     rotation = turn_matrix(degrees)[:3, :3]
     moved = [replace(patch, corners=(patch.corners - middle) * scale) for patch in patches]
     moved = [patch.chosen(_soup([patch]).area_faces > 1e-14) for patch in moved]
-    kept = np.split(bounding(_soup(moved)), np.cumsum([len(patch.corners) for patch in moved])[:-1])
-    seen = (patch.chosen(keep) for patch, keep in zip(moved, kept) if keep.any())
-    return [replace(patch, corners=patch.corners @ rotation.T) for patch in seen]
+    masks = np.split(bounding(_soup(moved)), np.cumsum([len(patch.corners) for patch in moved])[:-1])
+    visible = (patch.chosen(mask) for patch, mask in zip(moved, masks) if mask.any())
+    return [replace(patch, corners=patch.corners @ rotation.T) for patch in visible]
 
 
-def painted(patch: Patch, seed: int) -> Patch:
-    """The patch in a texture of ours: its colours, or its image's mean, mottled."""
+def mottled_patch(patch: Patch, seed: int) -> Patch:
+    """Returns the patch with noise on its colours, or on its image's mean."""
     base = patch.colours if patch.image is None else np.broadcast_to(_mean(patch.image), patch.colours.shape)
     corners = patch.corners.reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
@@ -89,7 +89,8 @@ def _of_trimesh(path: Path) -> list[Patch]:
 
 
 def _of_geometry(mesh: Any) -> Patch:
-    material, uv = getattr(mesh.visual, "material", None), getattr(mesh.visual, "uv", None)
+    material = getattr(mesh.visual, "material", None)
+    uv = getattr(mesh.visual, "uv", None)
     colour = GREY if material is None else np.asarray(material.main_color[:3]) / 255
     image = getattr(material, "image", None)
     corners = np.asarray(mesh.triangles, np.float64)
@@ -101,8 +102,8 @@ def _of_geometry(mesh: Any) -> Patch:
 def _of_ac3d(path: Path) -> list[Patch]:
     colours, found = load_surfaces(path)
     images = sorted({surfaces.image for surfaces in found})
-    alike = [_joined([surfaces for surfaces in found if surfaces.image == image]) for image in images]
-    return [patch for surfaces in alike for patch in _of_surfaces(surfaces, colours, path.parent)]
+    by_image = [_joined([surfaces for surfaces in found if surfaces.image == image]) for image in images]
+    return [patch for surfaces in by_image for patch in _of_surfaces(surfaces, colours, path.parent)]
 
 
 def _joined(parts: Sequence[Surfaces]) -> Surfaces:
@@ -118,17 +119,18 @@ def _of_surfaces(surfaces: Surfaces, colours: Float[np.ndarray, "materials 3"], 
         yield _patch(surfaces.corners, surfaces.uv, GREY, _pixels(Image.open(file)))
         return
     for material in np.unique(surfaces.material):
-        its = surfaces.material == material
-        yield _patch(surfaces.corners[its], surfaces.uv[its], colours[material], None)
+        of_material = surfaces.material == material
+        yield _patch(surfaces.corners[of_material], surfaces.uv[of_material], colours[material], None)
 
 
 def _patch(
     corners: Float[np.ndarray, "n 3 3"], uv: Float[np.ndarray, "n 3 2"], colour: Float[np.ndarray, "3"], image: Any
 ) -> Patch:
-    """An image of one colour, as painters use them, is that colour; and no place in an image is far off it."""
+    """Replaces an image of one colour by that colour, and garbage uv by zero."""
     if image is not None and np.ptp(image.reshape(-1, 3), axis=0).max() < 8:
-        colour, image = _mean(image), None
-    return Patch(corners, np.where(np.abs(uv) < FAR, uv, 0.0), np.broadcast_to(colour, corners.shape), image)
+        colour = _mean(image)
+        image = None
+    return Patch(corners, np.where(np.abs(uv) < LARGEST_UV, uv, 0.0), np.broadcast_to(colour, corners.shape), image)
 
 
 def _mean(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
@@ -136,4 +138,4 @@ def _mean(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
 
 
 def _pixels(image: Any) -> UInt8[np.ndarray, "height width 3"]:
-    return np.asarray(image.convert("RGBA").convert("RGB"))  # by way of RGBA: some palettes have transparent colours
+    return np.asarray(image.convert("RGBA").convert("RGB"))  # through RGBA, since palettes may have transparent colours

@@ -1,4 +1,4 @@
-"""A texture in space: value noise of several octaves (Ebert et al., *Texturing and Modeling*, 1994)."""
+"""A solid texture: value noise of several octaves (Ebert et al., *Texturing and Modeling*, 1994)."""
 
 import numpy as np
 from jaxtyping import Float
@@ -6,12 +6,14 @@ from jaxtyping import Float
 PERIOD = 64  # of the lattice of random values
 FIRST = 5.0  # cells per unit of length in the coarsest octave
 OCTAVES = 4
-DARKEST, BRIGHTEST = 0.12, 0.9  # so that black and white materials take the noise, too
-STRENGTH, TINT = 0.5, 0.15  # how far the noise moves brightness, and each colour apart
+DARKEST = 0.12  # so that black materials show the noise, too
+BRIGHTEST = 0.9  # so that white ones do
+STRENGTH = 0.5  # of the noise in log brightness
+TINT = 0.15  # of the noise in each colour channel
 
 
 def mottled(points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"], seed: int) -> Float[np.ndarray, "n 3"]:
-    """Colours (sRGB, 0 to 1) made darker and brighter, and a little redder or bluer, from place to place."""
+    """Returns colours (sRGB, 0 to 1) whose brightness and hue vary over space."""
     brightness = value_noise(points, seed)[:, None]
     hue = np.stack([value_noise(points, seed + channel) for channel in (1, 2, 3)], axis=1)
     base = np.clip(colours, 0.3, 0.75)
@@ -19,7 +21,7 @@ def mottled(points: Float[np.ndarray, "n 3"], colours: Float[np.ndarray, "n 3"],
 
 
 def value_noise(points: Float[np.ndarray, "n 3"], seed: int) -> Float[np.ndarray, "n"]:
-    """Smooth random values of about unit variance, the same for the same place and seed."""
+    """Returns smooth random values of about unit variance, a function of place and seed."""
     values = np.random.default_rng(seed).normal(size=(PERIOD, PERIOD, PERIOD))
     total = np.zeros(len(points))
     for octave in range(OCTAVES):

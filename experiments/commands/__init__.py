@@ -1,1 +1,1 @@
-"""One module for each kind of experiment."""
+"""Commands of `python -m experiments`."""

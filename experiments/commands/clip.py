@@ -1,4 +1,4 @@
-"""Images of a held-out shape from all around, by an independent renderer."""
+"""Clips of held-out shapes, by an independent renderer."""
 
 import os
 import time
@@ -11,13 +11,13 @@ import tyro
 from distrace.cli.console import console, origin, progress, start
 from distrace.data.solid import mesh_of
 from experiments.clips import clip, mitsuba_scene
-from experiments.clips.patches import Patch, has_images, load_patches, painted, placed
+from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
 from experiments.datasets.splits import Meshes
 
 
 @dataclass(frozen=True)
 class Clip:
-    """Film a held-out shape from all around with Mitsuba, for `multiview`; goes on where it was stopped."""
+    """Render a clip around a held-out shape with Mitsuba, for `multiview`; a second run resumes."""
 
     shape: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="SHAPE")]]
     split: str = "sofas"  # a bundled one, or a CSV file
@@ -26,7 +26,7 @@ class Clip:
     frames: int = 24
     size: int = 256
     background: clip.Background = "plain"
-    texture: clip.Texture | None = None  # by default the mesh's own where it has images, else a noise of ours
+    texture: clip.Texture | None = None  # by default the mesh's own images where it has them, else noise
     samples: int = 64  # light paths per pixel
 
     def run(self) -> None:
@@ -35,7 +35,7 @@ class Clip:
         version = mitsuba_scene.mitsuba().__version__
         path = mesh_of(shape, self.meshes)
         patches = load_patches(path)
-        wanted = clip.Clip(
+        description = clip.Clip(
             shape=shape.name,
             split=self.split,
             background=self.background,
@@ -49,35 +49,37 @@ class Clip:
             mitsuba=version,
         )
         run = start(self.out or Path("out/clips") / shape.name)
-        clip.begin(run.out, wanted)
-        rendered, took = filmed(wanted, patches, shape.turn, run.out)
-        per_frame = {"seconds_per_frame": took / rendered} if rendered else {}
-        run.finish({"frames": wanted.frames, "rendered": rendered, **per_frame, "cores": os.cpu_count(), **origin()})
+        clip.begin(run.out, description)
+        rendered, seconds = render_frames(description, patches, shape.turn, run.out)
+        per_frame = {"seconds_per_frame": seconds / rendered} if rendered else {}
+        counts = {"frames": description.frames, "rendered": rendered, "cores": os.cpu_count()}
+        run.finish({**counts, **per_frame, **origin()})
 
     def _texture(self, patches: list[Patch], path: Path) -> clip.Texture:
-        own = has_images(patches)
-        if self.texture == "own" and not own:
-            raise ValueError(f"{path} has no images of its own to speak of; use --texture procedural")
-        return self.texture or ("own" if own else "procedural")
+        textured = has_images(patches)
+        if self.texture == "own" and not textured:
+            raise ValueError(f"images cover too little of {path}; use --texture procedural")
+        return self.texture or ("own" if textured else "procedural")
 
 
-def filmed(wanted: clip.Clip, patches: list[Patch], turn: float, folder: Path) -> tuple[int, float]:
-    """Renders the frames that are missing; their number and the seconds that they took."""
-    frames = clip.missing(folder, wanted)
+def render_frames(description: clip.Clip, patches: list[Patch], turn: float, folder: Path) -> tuple[int, float]:
+    """Renders the missing frames; returns their number and the seconds."""
+    frames = clip.missing(folder, description)
     if not frames:
-        clip.save_views(folder, wanted)
+        clip.save_views(folder, description)
         return 0, 0.0
-    console.print(f"{wanted.shape} in its {'own' if wanted.texture == 'own' else 'procedural'} texture", markup=False)
-    shown = placed(patches, turn)
-    if wanted.texture == "procedural":
-        shown = [painted(patch, wanted.seed) for patch in shown]
-    stage = mitsuba_scene.staged(shown, wanted.background, wanted.seed)
-    began = time.perf_counter()
-    with progress("rendering", wanted.frames) as bar:
+    console.print(f"{description.shape}, {description.texture} texture", markup=False)
+    patches = placed(patches, turn)
+    if description.texture == "procedural":
+        patches = [mottled_patch(patch, description.seed) for patch in patches]
+    stage = mitsuba_scene.staged(patches, description.background, description.seed)
+    start_time = time.perf_counter()
+    with progress("rendering", description.frames) as bar:
         for frame in frames:
-            mask, depth = mitsuba_scene.truth(stage, wanted.cameras[frame])
-            image = mitsuba_scene.photograph(stage, wanted.cameras[frame], wanted.samples, wanted.seed + frame)
+            camera = description.cameras[frame]
+            mask, depth = mitsuba_scene.truth(stage, camera)
+            image = mitsuba_scene.photograph(stage, camera, description.samples, description.seed + frame)
             clip.save_frame(folder, frame, image, mask, depth)
             bar.advance(to=frame + 1)
-    clip.save_views(folder, wanted)
-    return len(frames), time.perf_counter() - began
+    clip.save_views(folder, description)
+    return len(frames), time.perf_counter() - start_time

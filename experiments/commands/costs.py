@@ -1,4 +1,4 @@
-"""What tracing costs as images, networks and views grow, where it is wrong, and how fast solvers complete shapes."""
+"""Costs and errors of tracing, and the speed of solvers."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +19,7 @@ Name = tyro.conf.Positional[ModelName]
 
 @dataclass(frozen=True)
 class Fields:
-    """Which pixels each strategy gets wrong on fields that break what sphere tracing assumes."""
+    """Count the wrong pixels of each strategy on fields that break what sphere tracing assumes."""
 
     model: Name = "sofas"
     out: Path = Path("out/fields")
@@ -41,7 +41,7 @@ class Fields:
 
 @dataclass(frozen=True)
 class Growth:
-    """How the cost grows with the sizes of image and network, and with the numbers of views and shapes."""
+    """Measure cost against the size of image and network, and the number of views and shapes."""
 
     model: Name = "sofas"
     out: Path = Path("out/growth")
@@ -72,7 +72,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class Memory:
-    """How much memory one image takes beyond the weights, up to 4096 × 4096 pixels."""
+    """Measure the memory of one image beyond the weights, up to 4096 × 4096 pixels."""
 
     model: Name = "sofas"
     out: Path = Path("out/memory")
@@ -93,7 +93,7 @@ class Memory:
 
 @dataclass(frozen=True)
 class Solvers:
-    """How fast Adam and Levenberg–Marquardt complete the held-out shapes."""
+    """Compare how fast Adam and Levenberg–Marquardt complete the held-out shapes."""
 
     model: Name = "sofas"
     split: str = "sofas"  # whose held-out shapes are completed

@@ -16,7 +16,7 @@ from distrace.processes import each_done
 from experiments.datasets.splits import CLASSES, Meshes
 from experiments.tables import depth_tables
 from experiments.tables.clip_page import save_clip_page
-from experiments.tables.focal import look_rows, looks
+from experiments.tables.focal import Rendering, rendering_rows, renderings_of
 from experiments.tables.multiview import METHODS as METHODS_OF_CLIPS
 from experiments.tables.multiview import ClipTrial, clip_done, described, multiview_rows, settings_of
 from experiments.tables.sparse_depth import (
@@ -35,9 +35,9 @@ from experiments.tables.trials import Place
 @dataclass(frozen=True)
 class _DepthTable:
     classes: tuple[str, ...] = CLASSES  # bundled splits, or CSV files
-    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
-    methods: tuple[str, ...] = METHODS  # or also points, points+normals: ours, not knowing the camera
-    shapes: int | None = None  # held-out ones of each class; by default all
+    models: tuple[str, ...] = ()  # of the classes; by default the bundled ones of the same names
+    methods: tuple[str, ...] = METHODS  # also points, points+normals: ours without the camera
+    shapes: int | None = None  # held out, of each class; by default all
     views: int = len(AZIMUTHS_ELEVATIONS)  # of each shape
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
@@ -45,10 +45,11 @@ class _DepthTable:
     jobs: int = 2  # processes
     device: str = "cpu"
 
-    def _run(self, name: str, more: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
-        """Each trial leaves a file in `trials`; what is there already is not done again. `more` facts may follow."""
+    def _run(self, name: str, extra: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
+        """Runs the trials that have no file in `trials`, and writes the table. `extra` returns further facts."""
         checked(self.jobs, self.shapes, self.views)
-        run, models = start(self.out, self.device), paired(self.classes, self.models)
+        run = start(self.out, self.device)
+        models = paired(self.classes, self.models)
         place = Place(self.meshes, run.out, models, self.resolution, run.device)
         trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
         results: list[Done] = []
@@ -68,12 +69,12 @@ class _DepthTable:
             "instances": [each.row() for each in results],
             "evaluations": sum(each.evaluations for each in results),
         }
-        run.finish({**facts, **more(place, trials), **origin()})
+        run.finish({**facts, **extra(place, trials), **origin()})
 
 
 @dataclass(frozen=True)
 class SparseDepth(_DepthTable):
-    """The published table: held-out shapes completed from ever fewer depths of one view. A second run goes on."""
+    """Make the published table: held-out shapes from ever fewer depths of one view. A second run resumes."""
 
     def run(self) -> None:
         self._run("sparse-depth")
@@ -81,7 +82,7 @@ class SparseDepth(_DepthTable):
 
 @dataclass(frozen=True)
 class Noise(_DepthTable):
-    """The same from a tenth of the depths, disturbed: noise, steps, outliers, holes. A second run goes on."""
+    """Complete shapes from a tenth of the depths with noise, steps, outliers or holes. A second run resumes."""
 
     def run(self) -> None:
         self._run("noise")
@@ -89,37 +90,43 @@ class Noise(_DepthTable):
 
 @dataclass(frozen=True)
 class Focal(_DepthTable):
-    """The same from a tenth of the depths, seen at other focal lengths; and what was fitted at one, looked at through
-    the others. A second run goes on."""
+    """Complete shapes from a tenth of the depths at other focal lengths, and render each fit at all of them.
+
+    A second run resumes.
+    """
 
     def run(self) -> None:
         self._run("focal", self._tested)
 
     def _tested(self, place: Place, trials: list[Trial]) -> dict:
-        usual, found = [trial for trial in trials if trial.focal_ratio == 1.0], []
-        with progress("looking through others", len(usual)) as bar:
-            for some in each_done(partial(looks, place), usual, self.jobs):
-                found += some
+        usual = [trial for trial in trials if trial.focal_ratio == 1.0]
+        renderings: list[Rendering] = []
+        with progress("rendering at other focal lengths", len(usual)) as bar:
+            for of_trial in each_done(partial(renderings_of, place), usual, self.jobs):
+                renderings += of_trial
                 bar.advance()
-        rows = sorted(look_rows(found), key=lambda row: (self.classes.index(str(row["class"])), str(row["method"])))
+        rows = sorted(
+            rendering_rows(renderings), key=lambda row: (self.classes.index(str(row["class"])), str(row["method"]))
+        )
         show_table(rows)
         return {"tests": rows}
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Whether several completions are apart where one of them is wrong."""
+    """Correlate the spread of several completions with the error of one."""
 
     classes: tuple[str, ...] = CLASSES
-    models: tuple[str, ...] = ()  # theirs; by default the bundled ones of the same names
-    shapes: int | None = None  # held-out ones of each class; by default all
+    models: tuple[str, ...] = ()  # of the classes; by default the bundled ones of the same names
+    shapes: int | None = None  # held out, of each class; by default all
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
 
     def run(self) -> None:
         checked(self.jobs, self.shapes)
-        run, rows = start(self.out), []
+        run = start(self.out)
+        rows = []
         models = paired(self.classes, self.models)
         chosen = {category: held_out(category, self.shapes) for category in self.classes}
         with progress("spread", sum(map(len, chosen.values()))) as bar:
@@ -128,21 +135,21 @@ class Spread:
                     rows.append(asdict(row))
                     bar.advance(f"{row.shape}: {row.correlation:.2f}")
         show_table(rows)
-        middle = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
-        console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in middle.items()))
-        run.finish({"rows": rows, "median_correlation": middle, **origin()})
+        medians = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
+        console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in medians.items()))
+        run.finish({"rows": rows, "median_correlation": medians, **origin()})
 
 
 @dataclass(frozen=True)
 class Multiview:
-    """Held-out shapes from clips: ours, masks alone, the nearest training shape, stereo. A second run goes on.
+    """Fit held-out shapes to clips: ours, masks alone, the nearest training shape, stereo. A second run resumes.
 
-    Each clip has a page with its frames, what each method found, and how far that is from the truth.
+    Each clip has a page with its frames, the surface of each method, and its distance from the true one.
     """
 
-    clips: tyro.conf.Positional[tuple[Path, ...]]  # folders as `distrace clip` makes them
+    clips: tyro.conf.Positional[tuple[Path, ...]]  # folders made by `python -m experiments clip`
     methods: tuple[str, ...] = METHODS_OF_CLIPS
-    model: str | None = None  # by default the bundled one of a clip's split
+    model: str | None = None  # by default the bundled one of the clip's split
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
@@ -150,24 +157,25 @@ class Multiview:
     def run(self) -> None:
         checked(self.jobs, None)
         if not self.clips:
-            raise ValueError("no clips were given; give folders as `distrace clip` makes them")
+            raise ValueError("no clips were given; `python -m experiments clip SHAPE` makes one")
         for method in self.methods:
             settings_of(method)
         for folder in self.clips:
             described(folder)
-        run, results = start(self.out), []
-        of_clip = {
+        run = start(self.out)
+        results = []
+        trials_of = {
             clip: [ClipTrial(clip, method, self.meshes, run.out, self.model) for method in self.methods]
             for clip in self.clips
         }
-        trials = [trial for some in of_clip.values() for trial in some]
+        trials = [trial for of_clip in trials_of.values() for trial in of_clip]
         with progress("multiview", len(trials)) as bar:
             for each in each_done(clip_done, trials, self.jobs):
                 results.append(each)
                 bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
         results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))
-        for clip, some in of_clip.items():
-            save_clip_page(run.out / "pages", clip, some, self.meshes)
+        for clip, of_clip in trials_of.items():
+            save_clip_page(run.out / "pages", clip, of_clip, self.meshes)
         rows = multiview_rows(results)
         show_table(rows)
         run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})
@@ -181,10 +189,10 @@ def checked(jobs: int, shapes: int | None, views: int = 1) -> None:
 
 
 def paired(classes: Sequence[str], models: Sequence[str]) -> tuple[tuple[str, str], ...]:
-    """Each class with its model. Raises `ValueError` for more or fewer of them."""
+    """Returns each class with its model. Raises `ValueError` for more or fewer models than classes."""
     models = models or classes
     if not classes:
-        raise ValueError(f"--classes names none; give some of {', '.join(CLASSES)}, or CSV files")
+        raise ValueError(f"--classes names none; choose from {', '.join(CLASSES)}, or give CSV files")
     if len(models) != len(classes):
         given = f"{len(models)} models ({', '.join(models)}) were given"
         raise ValueError(f"{given} for {len(classes)} classes ({', '.join(classes)}); give one each")

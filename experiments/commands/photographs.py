@@ -1,4 +1,4 @@
-"""Objects from real photographs, judged by views that were held out."""
+"""Objects from real photographs, measured on held-out views."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,9 @@ METHODS = ("ours", "hull")
 
 @dataclass(frozen=True)
 class Photographs:
-    """Objects from photographs, judged by held-out views: ours, and the painted visual hull. A second run goes on."""
+    """Measure held-out photographs against reconstructions: ours, and the visual hull. A second run resumes."""
 
-    folders: tyro.conf.Positional[tuple[Path, ...]]  # of photographs, as `reconstruct` takes them
+    folders: tyro.conf.Positional[tuple[Path, ...]]  # of photographs, as for `distrace reconstruct`
     methods: tuple[str, ...] = METHODS
     out: Path = Path("out/evaluate")
     steps: int = Reconstruct.steps
@@ -29,8 +29,12 @@ class Photographs:
         unknown = set(self.methods) - set(METHODS)
         if unknown or not self.folders or self.held_out < 1:
             given = f"methods {', '.join(self.methods)}, {len(self.folders)} folders and --held-out {self.held_out}"
-            raise ValueError(f"{given} were given; give folders, some of {', '.join(METHODS)}, and views to hold out")
-        run, rows, evaluations = start(self.out, self.device), [], 0
+            raise ValueError(
+                f"{given} were given; give folders, methods of {', '.join(METHODS)}, and views to hold out"
+            )
+        run = start(self.out, self.device)
+        rows = []
+        evaluations = 0
         for folder in self.folders:
             for method in self.methods:
                 result = self._result(folder, method)
@@ -40,8 +44,8 @@ class Photographs:
         run.finish({"rows": rows, "evaluations": evaluations, **origin()})
 
     def _result(self, folder: Path, method: str) -> dict:
-        """What `reconstruct` leaves in a folder of its own."""
+        """Runs `reconstruct` in a folder of its own, and returns its `result.json`."""
         out = self.out / f"{folder.resolve().name}-{method}"
-        own = {name: getattr(self, name) for name in ("steps", "sizes", "held_out", "device")}
-        Reconstruct(folder, out, silhouettes_only=method == "hull", **own).run()
+        options = {name: getattr(self, name) for name in ("steps", "sizes", "held_out", "device")}
+        Reconstruct(folder, out, silhouettes_only=method == "hull", **options).run()
         return read_json(out / "result.json")

@@ -1,4 +1,4 @@
-"""Shapes of a class put together at random."""
+"""Procedural shapes of a class."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,12 +15,14 @@ from distrace.files import written
 from distrace.shading import in_rows, save_png
 from experiments.procedural import procedural_mesh
 
-PREVIEWED, ACROSS, TILE = 32, 8, 128  # shapes, in a row, pixels
+PREVIEWED = 32  # shapes
+ACROSS = 8  # shapes in a row of the preview
+TILE = 128  # pixels
 
 
 @dataclass(frozen=True)
 class Procedural:
-    """Put shapes of a class together at random, to be sampled and learnt beside those that people drew."""
+    """Generate random shapes of a class, to train on besides real ones."""
 
     category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
     count: int = 240

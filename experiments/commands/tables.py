@@ -1,4 +1,4 @@
-"""Tables of results of models and of fits, as JSON, as pictures and in the terminal."""
+"""Tables of models and of fits, as JSON, as pictures and in the terminal."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -40,15 +40,15 @@ class _OfSplit:
     resolution: int = 256  # of the meshes that are compared
 
     def _run(self, name: str, side: str, results_of: Callable[..., Iterable[Result]], methods: int = 1) -> None:
-        run, split = start(self.out), self.split or self.model
-        shapes = on_side(side, split)
+        run = start(self.out)
+        shapes = on_side(side, self.split or self.model)
         results = results_of(opened(self.model, run.device), shapes, self.meshes, resolution=self.resolution)
-        _recorded(run, name, self.model, results, methods * len(shapes))
+        _collect(run, name, self.model, results, methods * len(shapes))
 
 
 @dataclass(frozen=True)
 class Training(_OfSplit):
-    """How well a model knows the shapes that it was trained on."""
+    """Measure the training shapes as a model represents them."""
 
     def run(self) -> None:
         self._run("training", "train", training_results)
@@ -56,7 +56,7 @@ class Training(_OfSplit):
 
 @dataclass(frozen=True)
 class HeldOut(_OfSplit):
-    """How well a model can say the shapes that it was not trained on, told distances all around them."""
+    """Measure the held-out shapes, fitted to distances all around them: the best that a model can represent."""
 
     def run(self) -> None:
         self._run("held-out", "test", held_out_results)
@@ -64,7 +64,7 @@ class HeldOut(_OfSplit):
 
 @dataclass(frozen=True)
 class Completion(_OfSplit):
-    """Held-out shapes completed from some depths of one view, by DeepSDF and by ours."""
+    """Complete held-out shapes from sparse depths of one view, by DeepSDF and by ours."""
 
     points: int = 100  # observed depths
     seed: int = 0
@@ -76,7 +76,7 @@ class Completion(_OfSplit):
 
 @dataclass(frozen=True)
 class Pose:
-    """How often a camera is found from one view; a second run goes on with what its `trials.json` lacks."""
+    """Count how often a disturbed camera is found from one view; a second run resumes from `trials.json`."""
 
     model: ModelName = "sofas"
     out: Path = Path("out/evaluate")
@@ -89,33 +89,34 @@ class Pose:
             raise ValueError(f"--cameras {self.cameras} and --jobs {self.jobs} were given; both must be at least 1")
         opened(self.model, run.device)
         trials = run.out / "trials.json"
-        kept = pose_table.read_trials(trials, self.model)
-        known = {found.trial for found in kept}
-        wanted = [trial for trial in pose_table.all_trials(self.cameras) if trial not in known]
-        with progress("cameras", len(wanted)) as bar:
-            for found in each_done(partial(pose_table.found, self.model), wanted, self.jobs):
-                kept.append(found)
-                pose_table.write_trials(trials, self.model, kept)
+        finished = pose_table.read_trials(trials, self.model)
+        done = {found.trial for found in finished}
+        missing = [trial for trial in pose_table.all_trials(self.cameras) if trial not in done]
+        with progress("cameras", len(missing)) as bar:
+            for found in each_done(partial(pose_table.found, self.model), missing, self.jobs):
+                finished.append(found)
+                pose_table.write_trials(trials, self.model, finished)
                 bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")
-        rows = pose_table.rows_of(self.model, kept)
+        rows = pose_table.rows_of(self.model, finished)
         show_table([{SHORT.get(key, key): value for key, value in row.items() if key != "model"} for row in rows])
         save_text(run.out / "index.html", pose_table.pose_page(self.model, rows))
-        run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in kept)})
+        run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in finished)})
 
 
-def _recorded(run: Run, name: str, model: str, results: Iterable[Result], count: int) -> None:
-    kept: list[Result] = []
+def _collect(run: Run, name: str, model: str, results: Iterable[Result], count: int) -> None:
+    """Writes the rows as they are measured, then the page, the picture and `result.json`."""
+    finished: list[Result] = []
     with progress(name, count) as bar:
         for result in results:
-            kept.append(result)
-            save_json(run.out / "rows.json", [done.row(model) for done in kept])
+            finished.append(result)
+            save_json(run.out / "rows.json", [each.row(model) for each in finished])
             bar.advance(f"{result.shape}, {result.method}: {result.chamfer:.3f}")
-    _record(run, name, model, kept)
+    _save(run, name, model, finished)
 
 
-def _record(run: Run, name: str, model: str, results: list[Result]) -> None:
+def _save(run: Run, name: str, model: str, results: list[Result]) -> None:
     if not results:
-        raise ValueError(f"{model} and the split have no shape in common that {name} is about; give a --split that has")
+        raise ValueError(f"{model} and the split have no shape in common for {name}; give a --split that has one")
     rows = [result.row(model) for result in results]
     totals = summary(results)
     show_table(rows)

@@ -1,4 +1,4 @@
-"""What models are trained on, and what they are like."""
+"""Training data of the models, and pictures of the models."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -15,14 +15,15 @@ from experiments.tables.training_choices import choice_rows, choices_with
 
 @dataclass(frozen=True)
 class Splits:
-    """How near the held-out shapes of a split are to those trained on, and which shapes are near-variants."""
+    """Measure the distance of each shape of a split to the others, to find near-variants."""
 
     splits: tuple[str, ...] = CLASSES  # bundled ones, or CSV files
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
 
     def run(self) -> None:
-        run, rows = start(self.out), []
+        run = start(self.out)
+        rows = []
         for split in self.splits:
             shapes = used(read_split(split))
             with progress(split, len(shapes)) as bar:
@@ -34,18 +35,19 @@ class Splits:
 
 @dataclass(frozen=True)
 class Choices:
-    """What a class is best learnt from: small networks trained on its shapes and on more and more variants of them."""
+    """Compare training sets and losses: small networks trained on a class and on more and more variants."""
 
     samples: Path = Path("out/samples")  # of the split, with `--mirror --variants 4`
     split: str = "chairs"
-    others: tuple[Path, ...] = ()  # folders of samples of other classes, for two choices more
+    others: tuple[Path, ...] = ()  # folders of samples of other classes, for two more choices
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     steps: int = 6000  # of each
     resolution: int = 128  # of the meshes that are compared
 
     def run(self) -> None:
-        run, rows = start(self.out), []
+        run = start(self.out)
+        rows = []
         tried = choice_rows(self.samples, self.split, self.meshes, self.steps, self.resolution, self.others)
         with progress("choices", len(choices_with(self.others))) as bar:
             for row in tried:
@@ -58,7 +60,7 @@ class Choices:
 
 @dataclass(frozen=True)
 class Card:
-    """For a card: pictures of each shape beside the truth and of walks between codes, and the table of shapes."""
+    """Make a model card: pictures of each shape next to the true one, walks between codes, and the table of shapes."""
 
     model: ModelName = "sofas"
     split: str | None = None  # by default that of the model's name
@@ -66,7 +68,8 @@ class Card:
     out: Path = Path("out/evaluate")
 
     def run(self) -> None:
-        run, shapes = start(self.out), read_split(self.split or self.model)
+        run = start(self.out)
+        shapes = read_split(self.split or self.model)
         model = opened(self.model, run.device)
         save_png(run.out / "walks.png", walks_picture(model, shapes))
         save_png(run.out / "shapes.png", pairs_picture(model, shapes, self.meshes))

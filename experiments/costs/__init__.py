@@ -1,1 +1,1 @@
-"""What tracing and fitting cost."""
+"""Costs of tracing and fitting."""

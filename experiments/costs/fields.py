@@ -1,4 +1,4 @@
-"""Which pixels every strategy gets wrong on fields that are not what sphere tracing assumes."""
+"""Wrong pixels of every strategy on fields that break what sphere tracing assumes."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -6,34 +6,34 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from distrace.benchmarks.hard_fields import hard_fields
 from distrace.benchmarks.measuring import OUTLIER, reference_depth
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.metrics import depth_errors
 from distrace.render import STRATEGIES, render
 from distrace.tracing.sphere_tracing import Outcome
+from experiments.fields.analytic import hard_fields
 
 COUNT = 5 * len(STRATEGIES)  # of rows
 
 
 @dataclass(frozen=True)
 class FieldRow:
-    """How many pixels one strategy gets wrong on one field, and how many of those it admits (EXHAUSTED)."""
+    """The wrong pixels of one strategy on one field, and those of them that are EXHAUSTED."""
 
     field: str
     strategy: str
     visible: int
-    wrong: int  # hit or not, or depth, by more than a thousandth
-    admitted: int
+    wrong: int  # missed or added, or off in depth by more than 0.001 radii
+    admitted: int  # wrong and EXHAUSTED
     exhausted: int  # of all pixels
     queries: int
 
 
 def field_rows(decoder: SDF, camera: Camera) -> Iterator[FieldRow]:
-    """Every strategy on every field."""
+    """Yields every strategy on every field."""
     for name, hard in hard_fields(decoder, camera).items():
-        truth = reference_depth(lambda points, hard=hard: hard.sdf(points) / hard.steepest, camera)
+        truth = reference_depth(lambda points, hard=hard: hard.sdf(points) / hard.lipschitz, camera)
         for strategy, config in STRATEGIES.items():
             with torch.no_grad():
                 buffers = render(hard.sdf, camera, config=config)

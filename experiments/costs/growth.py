@@ -1,4 +1,4 @@
-"""How the default tracer's cost grows with the sizes of image and network, and with the numbers of views and shapes."""
+"""Cost of the default tracer against the size of image and network, and the number of views and shapes."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -9,14 +9,15 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from distrace.benchmarks.measuring import Operations, in_turn, poster_view, recorded
-from distrace.benchmarks.untrained import ball
+from distrace.benchmarks.measuring import in_turn, poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.movie import turntable
 from distrace.render import STRATEGIES, Buffers, render
+from experiments.costs.counting import Operations, recorded
+from experiments.fields.untrained import ball
 
 BOTH = ("fast", "coarse_to_fine")
 MEASURED = (1024, 2048, 4096)  # pixels along each side, for which memory is measured
@@ -31,7 +32,7 @@ Device = torch.device | str
 
 @dataclass(frozen=True)
 class GrowthRow:
-    """What one image cost, or several of one shape or of several together. Times are medians, of runs in turn."""
+    """The cost of one image, or of several images together. Times are medians, of runs in turn."""
 
     axis: str
     value: str
@@ -45,50 +46,52 @@ class GrowthRow:
 
 
 def by_size(sdf: SDF, repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
-    """Fast and coarse-to-fine on the poster's view; the latter up to 512 pixels, where it takes most of a minute."""
+    """Yields `fast` and `coarse_to_fine` on the poster's view; the latter up to 512 pixels, where it takes a minute."""
     for size in SIZES:
         strategies = BOTH if size <= 512 else BOTH[:1]
-        yield from _rows("pixels", f"{size}", _in_a_row(sdf, [poster_view(size).to(device)], strategies), repeats)
+        yield from _rows("pixels", f"{size}", _runs(sdf, [poster_view(size).to(device)], strategies), repeats)
 
 
 def by_network(repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
-    """Untrained networks whose surface is about a sphere."""
+    """Yields untrained networks whose surface is about a sphere."""
     for layers, width in NETWORKS:
-        runs = _in_a_row(ball(layers, width, device), [poster_view(256).to(device)], BOTH)
+        runs = _runs(ball(layers, width, device), [poster_view(256).to(device)], BOTH)
         yield from _rows("network", f"{layers} × {width}", runs, repeats)
 
 
 def by_views(sdf: SDF, repeats: int, device: Device = "cpu") -> Iterator[GrowthRow]:
-    """Views around a shape, each with the occupancy of the first."""
+    """Yields views around a shape, which share the occupancy of the first."""
     for count in VIEWS:
         view = poster_view(256).to(device)
         cameras = turntable(view, count) if count > 1 else [view]
-        yield from _rows("views", f"{count}", _in_a_row(sdf, cameras, BOTH[:1]), repeats)
+        yield from _rows("views", f"{count}", _runs(sdf, cameras, BOTH[:1]), repeats)
 
 
 def by_shapes(model: Model, repeats: int) -> Iterator[GrowthRow]:
-    """Several shapes in one call, at 64 × 64 pixels each; and the evaluations of that call, alone."""
+    """Yields several shapes in one call, at 64 × 64 pixels each, and the network evaluations of that call alone."""
     for count in (count for count in SHAPES if count <= len(model.codes)):
-        field, one = model.field(model.codes[:count]), poster_view(64).to(model.codes.device)
-        pose, intrinsics = (each.expand(count, -1, -1) for each in (one.T_world_camera, one.intrinsics))
-        camera = replace(one, T_world_camera=pose, intrinsics=intrinsics)
+        field = model.field(model.codes[:count])
+        view = poster_view(64).to(model.codes.device)
+        poses = view.T_world_camera.expand(count, -1, -1)
+        camera = replace(view, T_world_camera=poses, intrinsics=view.intrinsics.expand(count, -1, -1))
         with recorded() as calls:
             buffers = render(field, camera)
-        runs = _in_a_row(field, [camera], BOTH[:1]) | {"its evaluations": partial(_again, calls, [buffers])}
+        runs = _runs(field, [camera], BOTH[:1]) | {"its evaluations": partial(_repeat, calls, [buffers])}
         yield from _rows("shapes", f"{count}", runs, repeats)
 
 
-def _again(calls: list[partial[Tensor]], views: list[Buffers]) -> list[Buffers]:
+def _repeat(calls: list[partial[Tensor]], views: list[Buffers]) -> list[Buffers]:
     for call in calls:
         call()
     return views
 
 
-def _in_a_row(sdf: SDF | BatchField, cameras: list[Camera], strategies: tuple[str, ...]) -> Runs:
-    """The views of a field by each strategy; later ones have the occupancy of the first."""
+def _runs(sdf: SDF | BatchField, cameras: list[Camera], strategies: tuple[str, ...]) -> Runs:
+    """Returns a function for each strategy that renders the views; all views reuse the first one's occupancy."""
 
     def run(strategy: str) -> list[Buffers]:
-        views, occupancy = [], None
+        views: list[Buffers] = []
+        occupancy = None
         for camera in cameras:
             views.append(render(sdf, camera, config=STRATEGIES[strategy], occupancy=occupancy))
             occupancy = views[-1].occupancy
@@ -103,10 +106,11 @@ def _rows(axis: str, value: str, runs: Runs, repeats: int) -> Iterator[GrowthRow
     def run(name: str) -> Buffers:
         if name in counted:
             return runs[name]()[-1]
-        with Operations() as operations:  # in the first run alone: counting takes time
+        with Operations() as operations:  # in the warm-up run only, since counting takes time
             views = runs[name]()
         visible = sum(int(view.mask.sum()) for view in views)
-        counted[name] = visible, sum(view.trace.total_evaluations for view in views), operations.count
+        queries = sum(view.trace.total_evaluations for view in views)
+        counted[name] = (visible, queries, operations.count)
         return views[-1]
 
     for name, (_, seconds, times) in in_turn({name: partial(run, name) for name in runs}, repeats).items():
@@ -115,7 +119,7 @@ def _rows(axis: str, value: str, runs: Runs, repeats: int) -> Iterator[GrowthRow
 
 
 def peak_memory(model: str, code: int, size: int) -> float:
-    """MiB that rendering the poster's view at a size takes beyond what was there before; in a process of its own."""
+    """Returns the MiB that rendering the poster's view adds to the process; it uses a process of its own."""
     with get_context("spawn").Pool(1) as pool:
         return pool.apply(_peak, (model, code, size))
 
@@ -124,13 +128,13 @@ def _peak(model: str, code: int, size: int) -> float:
     field = load_model(model).field(code)
     with torch.no_grad():
         render(field, poster_view(32))
-        Path("/proc/self/clear_refs").write_text("5")  # the peak counts from here
+        Path("/proc/self/clear_refs").write_text("5")  # resets the peak
         before = _memory("VmRSS")
         _ = render(field, poster_view(size)).depth
     return _memory("VmHWM") - before
 
 
-def _memory(what: str) -> float:
-    """MiB, as Linux has it."""
+def _memory(name: str) -> float:
+    """Returns a value of Linux's `/proc/self/status`, in MiB."""
     lines = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
-    return int(lines[what].split()[0]) / 1024
+    return int(lines[name].split()[0]) / 1024

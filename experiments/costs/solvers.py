@@ -1,4 +1,4 @@
-"""Adam against Levenberg–Marquardt: held-out shapes completed by both, and how the loss that Adam lowers falls."""
+"""Adam against Levenberg–Marquardt: the loss of held-out shapes against time."""
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -26,19 +26,19 @@ from distrace.prior import Prior, prior_of
 from experiments.tables.completion import OBSERVATION_SIZE
 
 ADAM = FitConfig(iterations=200, starts=1)
-# Adam's own loss, far down
+# converges further than the defaults, on Adam's own loss
 SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, robust=0, sharpening=0, compared=Comparison())
 POINTS = (100,)  # observed depths; 0: all of them
-RAYS = 1000  # with a depth, and as many of the silhouette, on which the loss of every curve is measured
+RAYS = 1000  # with a depth, and as many of the silhouette, that measure the loss of every curve
 RESOLUTION = 128  # of the meshes that are compared
-APART = 20  # iterations of Adam between two measurements
+EVERY = 20  # iterations of Adam between two measurements
 
 Loss = Callable[[Float[Tensor, "length"]], float]
 
 
 @dataclass(frozen=True)
 class Curve:
-    """The loss of a fit after some of its steps, and what they had taken until then."""
+    """The loss of a fit after some of its steps, and the seconds until then."""
 
     seconds: list[float]
     losses: list[float]
@@ -46,13 +46,13 @@ class Curve:
     code: Float[Tensor, "length"]
 
     def reached(self, loss: float) -> float | None:
-        """When the loss was no larger than that, if it ever was."""
+        """Returns the seconds until the loss was reached, or None."""
         return next((t for t, value in zip(self.seconds, self.losses, strict=True) if value <= loss), None)
 
 
 @dataclass(frozen=True)
 class SolverRow:
-    """A fit from the mean shape: its last loss, and when it had reached Adam's, as a part of Adam's time."""
+    """A fit from the mean shape: its last loss, and the time to reach Adam's last loss, also relative to Adam's."""
 
     shape: str
     points: int  # observed; 0: every pixel's
@@ -66,7 +66,7 @@ class SolverRow:
 
 
 def solver_rows(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[tuple[SolverRow, Curve]]:
-    """Each held-out shape completed from some and from all depths of one view and its mask, by both."""
+    """Yields each held-out shape, completed by both solvers from the depths of one view and its mask."""
     for shape in shapes:
         solid = solid_of(shape, meshes)
         full = replace(observe(solid, poster_view(OBSERVATION_SIZE)), normal=None)
@@ -78,10 +78,11 @@ def solver_rows(model: Model, shapes: list[Shape], meshes: Path, resolution: int
 def compared(
     model: Model, shape: str, points: int, view: View, truth: trimesh.Trimesh, resolution: int
 ) -> Iterator[tuple[SolverRow, Curve]]:
-    """Adam first, for its last loss is the other's aim."""
+    """Yields Adam first, since its last loss is the target of the other."""
     prior = prior_of(model.codes)
-    loss, decoder = common_loss(model, view, prior), model.decoder
-    adam = measured(fit_shape(decoder, [view], prior, ADAM), APART, loss)
+    loss = common_loss(model, view, prior)
+    decoder = model.decoder
+    adam = measured(fit_shape(decoder, [view], prior, ADAM), EVERY, loss)
     curves = {"adam": adam, "lm": measured(fit_code(decoder, [view], prior, SOLVER), 1, loss)}
     for name, curve in curves.items():
         reached = curve.reached(adam.losses[-1])
@@ -102,7 +103,7 @@ def compared(
 
 
 def common_loss(model: Model, view: View, prior: Prior) -> Loss:
-    """What `fit_shape` lowers, on rays that stay the same."""
+    """Returns the loss of `fit_shape` on fixed rays."""
     targets = Pool.of(view).draw(RAYS, RAYS, torch.Generator().manual_seed(ADAM.seed + 1))
 
     @torch.no_grad()
@@ -115,11 +116,17 @@ def common_loss(model: Model, view: View, prior: Prior) -> Loss:
 
 
 def measured(steps: Iterable[Step], every: int, loss: Loss) -> Curve:
-    """A fit's curve; measuring takes none of its time."""
-    passed, evaluations, seconds, losses, code = 0.0, 0, [], [], torch.empty(0)
+    """Returns a fit's curve; its seconds exclude the measurement."""
+    elapsed = 0.0
+    evaluations = 0
+    seconds: list[float] = []
+    losses: list[float] = []
+    code = torch.empty(0)
     for step in steps:
-        passed, evaluations, code = passed + step.seconds, evaluations + step.evaluations, step.code
+        elapsed += step.seconds
+        evaluations += step.evaluations
+        code = step.code
         if step.iteration % every == 0:
-            seconds.append(passed)
+            seconds.append(elapsed)
             losses.append(loss(code))
     return Curve(seconds, losses, evaluations, code)

@@ -1,1 +1,1 @@
-"""What the bundled models are trained on and tested with."""
+"""Training and test data of the bundled models."""

@@ -1,4 +1,4 @@
-"""What depth cameras do to depths: noise, steps, outliers and holes."""
+"""Errors of depth cameras: noise, quantisation, outliers and holes."""
 
 from dataclasses import replace
 
@@ -9,19 +9,21 @@ from torch.nn.functional import max_pool2d
 
 from distrace.data.observation import View
 
-SIZE = 2.0  # of an object: the diameter of the unit sphere
-STEP = 0.02  # of quantised depths, as a part of SIZE
-OUTLIERS, REACH = 0.1, 0.25  # the share of wrong depths, and how far they are off at most, as a part of SIZE
-GRAZING = 0.3  # cosines of surfaces that send too little light back
-JUMP = 8.0  # in pixels' widths, between neighbours: a camera of depth sees neither side
-SPOTS, SPOT = 4, 0.06  # holes of shiny or dark parts, and their radius as a part of the image's width
+SIZE = 2.0  # diameter of the unit sphere
+STEP = 0.02  # × SIZE, of quantised depths
+OUTLIERS = 0.1  # share of wrong depths
+REACH = 0.25  # × SIZE, their largest error
+GRAZING = 0.3  # cosine below which a surface reflects too little light
+JUMP = 8.0  # pixel widths between neighbours: a depth camera loses both sides
+SPOTS = 4  # holes at shiny or dark parts
+SPOT = 0.06  # × the image's width, the radius of a hole
 NOISES = ("0%", "1%", "2%", "3%", "5%", "quantised", "outliers", "holes")
 
 
 def noisy(view: View, noise: str, seed: int) -> View:
-    """The view with its depths disturbed; mask and normals stay. `noise` is one of NOISES, or another `…%`.
+    """Returns the view with noise on its depths; mask and normals stay. `noise` is one of NOISES, or another `…%`.
 
-    Raises `ValueError` for another word, or for holes without normals.
+    Raises `ValueError` for an unknown noise, or for holes without normals.
     """
     random = torch.Generator().manual_seed(seed)
     depth = view.depth
@@ -35,21 +37,21 @@ def noisy(view: View, noise: str, seed: int) -> View:
         off = (2 * torch.rand(depth.shape, generator=random) - 1) * REACH * SIZE
         return replace(view, depth=torch.where(wrong, depth + off, depth))
     if noise == "holes":
-        return replace(view, depth=depth.masked_fill(_unseen(view, random), torch.inf))
+        return replace(view, depth=depth.masked_fill(_holes(view, random), torch.inf))
     raise ValueError(f"there is no noise {noise!r}; give one of {', '.join(NOISES)}, or a share such as 4%")
 
 
-def _unseen(view: View, random: torch.Generator) -> Bool[Tensor, "height width"]:
-    """Grazing surfaces, both sides of a jump in depth, and a few spots."""
+def _holes(view: View, random: torch.Generator) -> Bool[Tensor, "height width"]:
+    """Returns grazing surfaces, both sides of jumps in depth, and a few spots."""
     if view.normal is None:
-        raise ValueError("holes lie where surfaces graze; they need a view with normals")
+        raise ValueError("holes need a view with normals, for grazing surfaces")
     towards = -view.camera.rays().directions
     grazing = (view.normal * towards).sum(-1) < GRAZING
     finite = view.depth.masked_fill(~view.seen, 0.0)[None]
     spread = max_pool2d(finite, 3, 1, 1) + max_pool2d(-finite, 3, 1, 1)
     jump = spread[0] > JUMP * finite[0] / view.camera.intrinsics[0, 0]
-    seen = view.seen.nonzero()
-    centres = seen[torch.randint(len(seen), (SPOTS,), generator=random)]
+    pixels = view.seen.nonzero()
+    centres = pixels[torch.randint(len(pixels), (SPOTS,), generator=random)]
     grid = torch.stack(torch.meshgrid(*(torch.arange(n) for n in view.depth.shape), indexing="ij"), dim=-1)
-    away = (grid[:, :, None] - centres).float().norm(dim=-1).amin(-1)
-    return grazing | jump | (away < SPOT * view.depth.shape[1])
+    distance = (grid[:, :, None] - centres).float().norm(dim=-1).amin(-1)
+    return grazing | jump | (distance < SPOT * view.depth.shape[1])

@@ -1,6 +1,6 @@
-"""Furniture and aircraft that nobody drew: shapes of a class put together from convex parts at random.
+"""Procedural furniture and aircraft: random shapes of a class, unions of convex parts.
 
-Twenty meshes of a class say little of what else there is; a network that also learns these says more shapes well.
+Twenty meshes cover little of a class; a network that also trains on these represents more shapes.
 """
 
 from collections.abc import Callable
@@ -24,12 +24,12 @@ GENERATORS: dict[str, Callable[[np.random.Generator], list[Part]]] = {
 
 
 def procedural_mesh(category: str, random: np.random.Generator) -> trimesh.Trimesh:
-    """A closed surface in the orientation of its class: furniture in metres, aircraft in lengths of their fuselage.
+    """Returns a closed mesh in the orientation of its class: furniture in metres, aircraft in fuselage lengths.
 
-    Raises `ValueError` for a class that there is no generator for.
+    Raises `ValueError` for a class without a generator.
     """
     if category not in GENERATORS:
-        raise ValueError(f"shapes of {category} cannot be made; those of {', '.join(GENERATORS)} can")
+        raise ValueError(f"there is no generator of {category}; choose from {', '.join(GENERATORS)}")
     hulls = [Manifold.hull_points(part) for part in GENERATORS[category](random)]
     mesh = Manifold.batch_boolean(hulls, OpType.Add).to_mesh64()
     return trimesh.Trimesh(mesh.vert_properties, mesh.tri_verts, process=False)

@@ -1,4 +1,4 @@
-"""Chairs that nobody drew."""
+"""Procedural chairs."""
 
 import numpy as np
 
@@ -9,10 +9,12 @@ from experiments.procedural.sofa import sofa
 
 
 def chair(random: np.random.Generator) -> list[Part]:
-    """One seat on legs, a foot or a frame, with or without back and arms; some are upholstered, some a shell."""
+    """Returns a seat on legs, a foot or a frame, with or without back and arms, sometimes upholstered or a shell."""
     if random.random() < 0.12:
         return sofa(random, wide=random.uniform(0.6, 0.95))
-    wide, deep, high = random.uniform(0.38, 0.62), random.uniform(0.38, 0.58), random.uniform(0.4, 0.52)
+    wide = random.uniform(0.38, 0.62)
+    deep = random.uniform(0.38, 0.58)
+    high = random.uniform(0.4, 0.52)
     top = high + random.uniform(0.28, 0.65)
     if random.random() < 0.17:
         parts = shell(random, wide, deep, (high, top)) + base(random, 0.8 * wide, 0.8 * deep, high - 0.02)
@@ -28,7 +30,7 @@ def chair(random: np.random.Generator) -> list[Part]:
 
 
 def seat(random: np.random.Generator, wide: float, deep: float, high: float, thick: float) -> list[Part]:
-    """A board or cushion, a round one, or slats on two bars."""
+    """Returns a board or cushion, a round seat, or slats on two bars."""
     style = random.choice(["board", "round", "slats"], p=[0.78, 0.1, 0.12])
     if style == "round":
         return [disc((0, high - thick, 0), wide / 2, thick, deep / wide)]
@@ -45,14 +47,12 @@ def seat(random: np.random.Generator, wide: float, deep: float, high: float, thi
 
 
 def base(random: np.random.Generator, wide: float, deep: float, high: float) -> list[Part]:
-    """What carries a seat of which the underside is at `high`."""
+    """Returns what carries a seat whose underside is at `high`."""
     styles = ["legs", "foot", "sled", "cantilever", "crossed", "folding"]
     style = random.choice(styles, p=[0.5, 0.2, 0.08, 0.08, 0.07, 0.07])
-    x, z, thin = (
-        wide / 2 - random.uniform(0.015, 0.06),
-        deep / 2 - random.uniform(0.015, 0.06),
-        random.uniform(0.008, 0.025),
-    )
+    x = wide / 2 - random.uniform(0.015, 0.06)
+    z = deep / 2 - random.uniform(0.015, 0.06)
+    thin = random.uniform(0.008, 0.025)
     if style == "legs":
         return legs(random, (x, z), high, thin)
     if style == "foot":
@@ -61,7 +61,8 @@ def base(random: np.random.Generator, wide: float, deep: float, high: float) -> 
         return folding(random, (x, z), high)
     parts = []
     for s in (-x, x):
-        front, rear = (s, thin, z), (s, thin, -z)
+        front = (s, thin, z)
+        rear = (s, thin, -z)
         if style == "crossed":
             parts += [rod(front, (s, high, -z), thin, thin), rod(rear, (s, high, z), thin, thin)]
         else:
@@ -71,10 +72,15 @@ def base(random: np.random.Generator, wide: float, deep: float, high: float) -> 
 
 
 def folding(random: np.random.Generator, place: tuple[float, float], high: float) -> list[Part]:
-    """Two frames that cross at the sides; the one that stands in front goes on upwards behind the seat."""
-    (x, z), thin, inner = place, random.uniform(0.007, 0.015), random.uniform(0.0, 0.03)
-    rear, meets, above = -z * random.uniform(0.6, 1.1), z * random.uniform(0.1, 1.0), random.uniform(0.0, 0.45)
-    slope, parts = -2 * z * random.uniform(0.7, 1.0) / high, []
+    """Returns two frames that cross at the sides; the front one continues upwards behind the seat."""
+    x, z = place
+    thin = random.uniform(0.007, 0.015)
+    inner = random.uniform(0.0, 0.03)
+    rear = -z * random.uniform(0.6, 1.1)
+    meets = z * random.uniform(0.1, 1.0)
+    above = random.uniform(0.0, 0.45)
+    slope = -2 * z * random.uniform(0.7, 1.0) / high
+    parts = []
     ends = [((x, 0.0, z), (x, high + above, z + slope * (high + above)))]
     ends += [((x - inner, 0.0, rear), (x - inner, high, meets))]
     for begin, end in ends:
@@ -86,8 +92,10 @@ def folding(random: np.random.Generator, place: tuple[float, float], high: float
 
 
 def legs(random: np.random.Generator, place: tuple[float, float], high: float, thin: float) -> list[Part]:
-    """Four, round or square, upright or splayed, with or without stretchers."""
-    (x, z), splay, taper = place, random.choice([0.0, random.uniform(0.01, 0.09)]), random.uniform(1.0, 1.7)
+    """Returns four legs, round or square, upright or splayed, with or without stretchers."""
+    x, z = place
+    splay = random.choice([0.0, random.uniform(0.01, 0.09)])
+    taper = random.uniform(1.0, 1.7)
     square = random.random() < 0.4
 
     def at(a: float, b: float, y: float) -> Point:
@@ -109,10 +117,13 @@ def legs(random: np.random.Generator, place: tuple[float, float], high: float, t
 
 
 def back(random: np.random.Generator, wide: float, deep: float, heights: tuple[float, float]) -> list[Part]:
-    """A board, straight or bowed, or a frame with slats, rungs or a cushion; it leans backwards."""
-    (seat_top, top), rear, half = heights, -deep / 2, wide / 2
+    """Returns a board, straight or bowed, or a frame with slats, rungs or a cushion, leaning backwards."""
+    seat_top, top = heights
+    rear = -deep / 2
+    half = wide / 2
     style = random.choice(["board", "bowed", "upright", "ladder", "frame"], p=[0.3, 0.2, 0.2, 0.2, 0.1])
-    thin, hinge = random.uniform(0.01, 0.022), np.array([0.0, seat_top, rear + 0.02])
+    thin = random.uniform(0.01, 0.022)
+    hinge = np.array([0.0, seat_top, rear + 0.02])
     low = seat_top + random.choice([-0.03, random.uniform(0.02, 0.5) * (top - seat_top)])
     posts = [
         rod((s * (half - thin), seat_top - 0.04, rear + 0.02), (s * (half - thin), top, rear + 0.02), thin, thin)
@@ -147,9 +158,11 @@ def back(random: np.random.Generator, wide: float, deep: float, heights: tuple[f
 
 
 def arms(random: np.random.Generator, wide: float, deep: float, seat_top: float, above: float) -> list[Part]:
-    """A pair of rails, on posts at the front or in the middle, or of closed sides."""
-    thick, x = random.uniform(0.012, 0.03), wide / 2 + random.uniform(-0.01, 0.04)
-    front, y = deep / 2 * random.uniform(0.4, 1.0), seat_top + above
+    """Returns a pair of rails on posts, at the front or in the middle, or closed sides."""
+    thick = random.uniform(0.012, 0.03)
+    x = wide / 2 + random.uniform(-0.01, 0.04)
+    front = deep / 2 * random.uniform(0.4, 1.0)
+    y = seat_top + above
     if random.random() < 0.2:
         return [
             block((s * x - thick, seat_top - 0.1, -deep / 2), (s * x + thick, y, front), thick * 0.6) for s in (-1, 1)

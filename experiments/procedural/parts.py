@@ -1,4 +1,4 @@
-"""What furniture is put together from: rounded blocks and rods, each the convex hull of some points.
+"""Parts of furniture: rounded blocks and rods, each the convex hull of its points.
 
 Sizes are in metres, y is up, and fronts look to +z.
 """
@@ -22,16 +22,19 @@ CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)
 
 
 def block(low: Vector, high: Vector, radius: float) -> Part:
-    """A box with rounded edges."""
-    low, high = np.asarray(low, np.float64), np.asarray(high, np.float64)
+    """Returns a box with rounded edges."""
+    low = np.asarray(low, np.float64)
+    high = np.asarray(high, np.float64)
     radius = min(radius, 0.499 * float((high - low).min()))
-    middle, half = (low + high) / 2, (high - low) / 2 - radius
+    middle = (low + high) / 2
+    half = (high - low) / 2 - radius
     return (middle + BALL[:, None] * radius + half * CORNERS).reshape(-1, 3)
 
 
 def rod(begin: Vector, end: Vector, thin: float, thick: float, sides: int = 12) -> Part:
-    """A round rod from one end, of radius `thin`, to the other, of radius `thick`."""
-    begin, end = np.asarray(begin, np.float64), np.asarray(end, np.float64)
+    """Returns a round rod from one end, of radius `thin`, to the other, of radius `thick`."""
+    begin = np.asarray(begin, np.float64)
+    end = np.asarray(end, np.float64)
     along = end - begin
     across = np.linalg.svd(along[None])[2][1:]
     angles = np.linspace(0, 2 * np.pi, sides, endpoint=False)
@@ -40,25 +43,25 @@ def rod(begin: Vector, end: Vector, thin: float, thick: float, sides: int = 12) 
 
 
 def post(begin: Vector, end: Vector, thin: float, thick: float) -> Part:
-    """An upright one that is square."""
+    """Returns an upright square rod."""
     square = np.array([[x, 0.0, z] for x in (-1, 1) for z in (-1, 1)])
     return np.concatenate([np.asarray(begin) + thin * square, np.asarray(end) + thick * square])
 
 
 def bar(begin: Vector, end: Vector, radius: float) -> Part:
-    """A round one, as thick everywhere."""
+    """Returns a round rod of constant radius."""
     return rod(begin, end, radius, radius, 8)
 
 
 def disc(place: Vector, radius: float, thick: float, narrow: float = 1.0) -> Part:
-    """A lying one, from its underside's middle upwards; `narrow` × as deep as wide."""
+    """Returns a horizontal disc on its underside's middle; its depth is `narrow` × its width."""
     x, y, z = place
     lying = rod(place, (x, y + thick, z), radius, radius, 48)
     return lying * (1, 1, narrow)
 
 
 def bowed(low: Vector, high: Vector, bow: float, radius: float) -> list[Part]:
-    """A board that stands, its sides further in front by `bow` than its middle."""
+    """Returns an upright board whose sides are `bow` in front of its middle."""
     ends = np.linspace(low[0], high[0], 2 if not bow else 8)
     depths = bow * (ends / max(abs(ends[0]), 1e-9)) ** 2
     edges = [block((x, low[1], low[2] + z), (x + 1e-3, high[1], high[2] + z), radius) for x, z in zip(ends, depths)]
@@ -66,23 +69,25 @@ def bowed(low: Vector, high: Vector, bow: float, radius: float) -> list[Part]:
 
 
 def sheet(grid: Float[np.ndarray, "rows columns 3"], thick: float) -> list[Part]:
-    """A curved one through the points of a grid: one part for each four of them, which need not lie in a plane."""
+    """Returns a curved sheet through the points of a grid: one part for each four neighbours."""
     corners = np.concatenate([grid[:-1, :-1], grid[1:, :-1], grid[:-1, 1:], grid[1:, 1:]], axis=-1).reshape(-1, 4, 3)
     return list((corners[:, :, None] + thick / 2 * OCTAHEDRON).reshape(len(corners), -1, 3))
 
 
 def row(count: int, low: Vector, high: Vector, radius: float, axis: int = 0, gap: float = 0.0) -> list[Part]:
-    """Blocks side by side, so far apart."""
+    """Returns blocks side by side, `gap` apart."""
     ends = np.linspace(low[axis], high[axis], count + 1)
     parts = []
     for first, last in pairwise(ends):
-        begin, end = np.array(low, np.float64), np.array(high, np.float64)
+        begin = np.array(low, np.float64)
+        end = np.array(high, np.float64)
         begin[axis], end[axis] = first + gap / 2, last - gap / 2
         parts.append(block(begin, end, radius))
     return parts
 
 
 def tilted(part: Part, degrees: float) -> Part:
-    """Turned about the x axis: what is above the origin goes to the front, or, for negative angles, to the rear."""
-    cosine, sine = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    """Rotates a part about the x axis: its top moves to the front, or to the rear for negative angles."""
+    cosine = np.cos(np.radians(degrees))
+    sine = np.sin(np.radians(degrees))
     return part @ np.array([[1, 0, 0], [0, cosine, sine], [0, -sine, cosine]])

@@ -1,4 +1,4 @@
-"""Tables that nobody drew."""
+"""Procedural tables."""
 
 import numpy as np
 
@@ -8,14 +8,16 @@ from experiments.procedural.parts import Part, bar, block, disc
 
 
 def table(random: np.random.Generator) -> list[Part]:
-    """A top on legs, feet, sides or trestles, with or without shelf and drawers."""
+    """Returns a top on legs, a foot, sides or trestles, with or without shelf and drawers."""
     wide = random.uniform(0.45, 2.2)
     deep = wide * random.uniform(0.35, 1.0) if wide < 1.1 else random.uniform(0.45, 1.1)
-    high, thick = random.uniform(0.35, 0.8), random.uniform(0.012, 0.08)
+    high = random.uniform(0.35, 0.8)
+    thick = random.uniform(0.012, 0.08)
     round_top = random.random() < 0.3
     parts = [top(random, wide, deep, high, thick, round_top)]
     inset = 0.7 if round_top else 1.0
-    under, half = high - thick / 2, (inset * wide / 2, inset * deep / 2)
+    under = high - thick / 2
+    half = (inset * wide / 2, inset * deep / 2)
     style = random.choice(["legs", "foot", "sides", "frames", "trestles"], p=[0.55, 0.15, 0.1, 0.1, 0.1])
     if round_top and style not in ("legs", "foot"):
         style = "foot"
@@ -32,17 +34,17 @@ def table(random: np.random.Generator) -> list[Part]:
 def top(random: np.random.Generator, wide: float, deep: float, high: float, thick: float, round_top: bool) -> Part:
     if round_top:
         return disc((0, high - thick, 0), wide / 2, thick, deep / wide if random.random() < 0.5 else 1.0)
-    low, far = (-wide / 2, high - thick, -deep / 2), (wide / 2, high, deep / 2)
+    low = (-wide / 2, high - thick, -deep / 2)
+    far = (wide / 2, high, deep / 2)
     return block(low, far, thick * random.uniform(0.02, 0.4))
 
 
 def ends(random: np.random.Generator, style: str, half: tuple[float, float], high: float) -> list[Part]:
-    """A pair: boards, closed frames, or trestles shaped like T, A or X, with a beam between."""
-    (x, z), thin = (
-        (half[0] * random.uniform(0.6, 0.97), half[1] * random.uniform(0.6, 0.97)),
-        random.uniform(0.012, 0.035),
-    )
-    shape, beam = random.choice(["T", "A", "X"]), high * random.uniform(0.2, 0.8)
+    """Returns a pair of boards, closed frames, or trestles shaped like T, A or X, with a beam between."""
+    x, z = (half[0] * random.uniform(0.6, 0.97), half[1] * random.uniform(0.6, 0.97))
+    thin = random.uniform(0.012, 0.035)
+    shape = random.choice(["T", "A", "X"])
+    beam = high * random.uniform(0.2, 0.8)
     parts: list[Part] = []
     for s in (-x, x):
         corners = [(s, thin, -z), (s, thin, z), (s, high, z), (s, high, -z)]
@@ -63,13 +65,16 @@ def ends(random: np.random.Generator, style: str, half: tuple[float, float], hig
 
 
 def extras(random: np.random.Generator, half: tuple[float, float], high: float, round_top: bool) -> list[Part]:
-    """A shelf below, or drawers under one end or both."""
-    (x, z), parts = half, []
+    """Returns a shelf below the top, or drawers under one end or both, or nothing."""
+    x, z = half
+    parts = []
     if random.random() < 0.2:
-        y, edge = high * random.uniform(0.15, 0.5), random.uniform(0.03, 0.1)
+        y = high * random.uniform(0.15, 0.5)
+        edge = random.uniform(0.03, 0.1)
         parts.append(block((-x + edge, y, -z + edge), (x - edge, y + 0.025, z - edge), 0.005))
     if not round_top and random.random() < 0.2:
-        wide, low = min(random.uniform(0.3, 0.5), x), high * random.choice([0.0, 0.1, 0.5, 0.75])
+        wide = min(random.uniform(0.3, 0.5), x)
+        low = high * random.choice([0.0, 0.1, 0.5, 0.75])
         for side in [(-1,), (1,), (-1, 1)][random.integers(3)]:
             left, right = sorted((side * (x - 0.03), side * (x - wide)))
             parts.append(block((left, low, -z + 0.04), (right, high, z - 0.04), 0.008))

@@ -1,1 +1,1 @@
-"""What fits and models are measured by."""
+"""Tables of fits and of models."""

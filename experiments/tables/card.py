@@ -1,4 +1,4 @@
-"""What to know of a model: its shapes beside the true ones, walks between codes, and what it was trained on."""
+"""Pictures and the table of a model card: shapes and the true ones, walks between codes, training shapes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,12 +19,14 @@ from distrace.shading import Picture, grid, in_rows, side_by_side
 
 TILE = 128  # pixels
 ACROSS = 8  # pairs in a row
-WALKS, STRIDES = 4, 8
+WALKS = 4
+STEPS = 8  # of a walk
 
 
 def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Picture:
-    """Of each training shape the true surface, and beside it what the model makes of its code."""
-    camera, pairs = poster_view(TILE), []
+    """Returns each training shape's true surface next to the surface of its code."""
+    camera = poster_view(TILE)
+    pairs = []
     for shape in shapes:
         if shape.name in model.shapes:
             truth = pictured(solid_of(shape, meshes), camera)
@@ -35,15 +37,15 @@ def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Pictur
 
 
 def walks_picture(model: Model, shapes: Sequence[Shape]) -> Picture:
-    """Straight walks between codes of training shapes that are far apart in the list, one in a row."""
-    known = [model.shapes.index(shape.name) for shape in shapes if shape.name in model.shapes]
-    some = known[:: max(len(known) // (2 * WALKS), 1)]
-    return grid([[_shaded(model, code) for code in walk(model, *pair)] for pair in zip(some[0::2], some[1::2])][:WALKS])
+    """Returns a row for each walk between codes of training shapes that are far apart in the list."""
+    codes = [model.shapes.index(shape.name) for shape in shapes if shape.name in model.shapes]
+    ends = codes[:: max(len(codes) // (2 * WALKS), 1)]
+    return grid([[_shaded(model, code) for code in walk(model, *pair)] for pair in zip(ends[0::2], ends[1::2])][:WALKS])
 
 
 def walk(model: Model, first: int, last: int) -> list[Float[Tensor, "length"]]:
-    """Codes from one training shape's to another's, at even strides."""
-    return [torch.lerp(model.codes[first], model.codes[last], k / (STRIDES - 1)) for k in range(STRIDES)]
+    """Returns codes at equal steps between two training shapes."""
+    return [torch.lerp(model.codes[first], model.codes[last], k / (STEPS - 1)) for k in range(STEPS)]
 
 
 def _shaded(model: Model, code: Float[Tensor, "length"]) -> Picture:
@@ -52,7 +54,7 @@ def _shaded(model: Model, code: Float[Tensor, "length"]) -> Picture:
 
 
 def shapes_table(shapes: Sequence[Shape]) -> str:
-    """Every shape of the split in Markdown: on which side it is, or why on none, and whose it is."""
+    """Returns the split as a Markdown table: side or reason, creator and licence of each shape."""
     sides = {"train": "trained on", "test": "held out"}
     lines = [
         f"| {shape.name} | {sides.get(shape.split, f'left out: {shape.note}')} | {shape.creator} | {shape.licence} |"

@@ -1,4 +1,4 @@
-"""The page of a clip: some of its frames, what each method made of them, and how far that is from the true surface."""
+"""The page of a clip: frames, the surface of each method, and its distance from the true surface."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,17 +21,18 @@ from experiments.tables.multiview import ClipResult, ClipTrial, Surface, clip_do
 from experiments.tables.sparse_depth import true_solid
 
 SHOWN = 6  # frames
-EYES = 2  # of these that shapes are drawn from
+EYES = 2  # of these cameras, from which shapes are rendered
 SIZE = 192  # pixels
-LIMIT = 0.1  # distance from the true surface that has the strongest colour
+LIMIT = 0.1  # radii from the true surface: the strongest colour
 
 
 def save_clip_page(out: Path, folder: Path, trials: Sequence[ClipTrial], meshes: Path) -> None:
-    """The page of trials that are done, and its comparison as a picture."""
+    """Writes the page of finished trials, and its comparison as a picture."""
     clip = described(folder)
     true = true_solid(meshes, clip["split"], clip["shape"])
     surfaces = {trial.method: surface_of(trial) for trial in trials}
-    name, results = f"{clip['shape']}_{clip['background']}", [clip_done(trial) for trial in trials]
+    name = f"{clip['shape']}_{clip['background']}"
+    results = [clip_done(trial) for trial in trials]
     frames = _frames(folder)
     picture = comparison(frames, surfaces, true)
     save_png(out / f"{name}.png", picture)
@@ -45,7 +46,7 @@ def clip_page(
     surfaces: Mapping[str, Surface],
     true: Solid,
 ) -> str:
-    """Frames, shapes and figures of one clip, and all surfaces to turn."""
+    """Returns the page: frames, shapes, figures, and all surfaces in 3-D."""
     first = results[0]
     meshes = {name: each for name, each in surfaces.items() if isinstance(each, trimesh.Trimesh)}
     clouds = {name: each for name, each in surfaces.items() if isinstance(each, np.ndarray)}
@@ -53,12 +54,14 @@ def clip_page(
     colours = error_picture(np.linspace(0, LIMIT, 9)[None], LIMIT)
     return page(
         f"{first.shape} from a clip",
-        f"{first.category}, {first.background} background; cameras were known, and masks to silhouettes alone.",
+        f"{first.category}, {first.background} background; all methods have the cameras, one the masks.",
         [
             section("Frames", row(*(figure(colour_picture(view.image), view.name) for view in frames))),
             section(
                 "Shapes",
-                paragraph(f"The true shape, then {', '.join(surfaces)}: below, how far each is from the true surface."),
+                paragraph(
+                    f"The true shape, then {', '.join(surfaces)}. Below: the distance of each from the true surface."
+                ),
                 figure(picture, "from two of the frames' cameras"),
                 ramp("on the surface", f"{LIMIT:g} radii away", colours),
             ),
@@ -69,12 +72,13 @@ def clip_page(
 
 
 def comparison(frames: Sequence[Photograph], surfaces: Mapping[str, Surface], true: Solid) -> Picture:
-    """From some frames' cameras: the true shape and those found, shaded; under each its distance from the truth."""
+    """Returns, for EYES cameras, the shaded surfaces, and below each its distance from the true one."""
     lines: list[list[Picture]] = []
-    for frame in frames[1 :: -(-len(frames) // EYES)]:  # the first would see the shape from straight ahead
+    for frame in frames[1 :: -(-len(frames) // EYES)]:  # the first camera faces the front
         truth = _shaded(observe(true, frame.camera))
-        seen = [_seen(surface, frame.camera) for surface in surfaces.values()]
-        lines += [[truth, *map(_shaded, seen)], [np.full_like(truth, 255), *(_apart(view, true) for view in seen)]]
+        views = [_observed(surface, frame.camera) for surface in surfaces.values()]
+        errors = [_error_picture(view, true) for view in views]
+        lines += [[truth, *map(_shaded, views)], [np.full_like(truth, 255), *errors]]
     return grid(lines)
 
 
@@ -83,21 +87,21 @@ def _frames(folder: Path) -> list[Photograph]:
     return [view.at_most(SIZE) for view in views[:: -(-len(views) // SHOWN)]]
 
 
-def _seen(surface: Surface, camera: Camera) -> View:
+def _observed(surface: Surface, camera: Camera) -> View:
     if isinstance(surface, np.ndarray):
         return Cloud(torch.from_numpy(surface).float()).seen_from(camera)
     return observe(Solid(surface, surface), camera)
 
 
 def _shaded(view: View) -> Picture:
-    """As clay; points, which have no normals, as dots."""
+    """Shades a mesh as clay, and points, which have no normals, as dots."""
     if view.shaded is not None:
         return view.shaded
     return np.where(view.seen[..., None].numpy(), 96, 255).repeat(3, axis=-1).astype(np.uint8)
 
 
-def _apart(view: View, true: Solid) -> Picture:
-    """How far what is seen is from the true surface."""
+def _error_picture(view: View, true: Solid) -> Picture:
+    """Returns the distance of the visible points from the true surface as colours."""
     distance = np.full(view.depth.shape, np.nan)
     distance[view.seen.numpy()] = true.apart(view.points().double().numpy())
     return error_picture(distance, LIMIT)

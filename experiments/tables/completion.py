@@ -1,4 +1,4 @@
-"""Results tables: how well a model knows its shapes, and how well shapes are completed from one sparse view."""
+"""Tables of a model's training and held-out shapes, and of completion from one sparse view."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,14 +27,14 @@ from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 
 OBSERVATION_SIZE = 256
-TOLD = 40_000  # distances that a held-out shape is told by, …
-TOLD_NEAR = 0.5  # … and how many of them are near the surface: the others tell where nothing is
-TOLD_FIT = CodeFitConfig(iterations=40, robust=0, compared=Comparison(Weights(code=1e-4)))
+SAMPLES = 40_000  # distances that a held-out shape is fitted to
+SAMPLES_NEAR = 0.5  # share of them near the surface; the rest covers free space
+SAMPLES_FIT = CodeFitConfig(iterations=40, robust=0, compared=Comparison(Weights(code=1e-4)))
 
 
 @dataclass(frozen=True)
 class Result:
-    """A predicted surface beside the true one."""
+    """A predicted surface and the true one."""
 
     shape: str
     method: str
@@ -60,7 +60,7 @@ class Result:
 
 
 def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
-    """Each training shape as its code gives it, against the outer surface of its mesh."""
+    """Yields each training shape by its code, against the outer surface of its mesh."""
     for shape in shapes:
         if shape.name in model.shapes:
             mesh = extract_mesh(model.field(model.code_of(shape.name)), MeshConfig(resolution))
@@ -68,15 +68,15 @@ def training_results(model: Model, shapes: list[Shape], meshes: Path, resolution
 
 
 def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution: int) -> Iterator[Result]:
-    """Each held-out shape as the code says it best: fitted to distances all around it."""
+    """Yields each held-out shape by the code that fits distances all around it."""
     for shape in shapes:
-        yield best_told(model, shape.name, solid_of(shape, meshes), resolution)
+        yield fit_to_distances(model, shape.name, solid_of(shape, meshes), resolution)
 
 
-def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
-    """A solid as the model says it best."""
-    samples = torch.from_numpy(sample(solid, TOLD, seed=0, near=TOLD_NEAR))
-    steps = list(fit_points(model.decoder, samples, prior_of(model.codes), TOLD_FIT))
+def fit_to_distances(model: Model, name: str, solid: Solid, resolution: int) -> Result:
+    """Returns the best representation of a solid by the model."""
+    samples = torch.from_numpy(sample(solid, SAMPLES, seed=0, near=SAMPLES_NEAR))
+    steps = list(fit_points(model.decoder, samples, prior_of(model.codes), SAMPLES_FIT))
     seconds = sum(step.seconds for step in steps)
     mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution))
     return compared(name, "all distances", 0, mesh, solid.surface, seconds)
@@ -85,14 +85,14 @@ def best_told(model: Model, name: str, solid: Solid, resolution: int) -> Result:
 def completion_results(
     model: Model, shapes: list[Shape], meshes: Path, points: int, config: CodeFitConfig, resolution: int
 ) -> Iterator[Result]:
-    """Each held-out shape completed from `points` depths of one view, by each method."""
+    """Yields each held-out shape, completed from `points` depths of one view by each method."""
     for shape in shapes:
         solid = solid_of(shape, meshes)
         view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
         for method in METHODS:
-            seen = told(view, method)
-            steps = list(steps_of(model, seen, method, config))
-            mesh = completed(model.field(steps[-1].code), seen, MeshConfig(resolution))
+            observation = told(view, method)
+            steps = list(steps_of(model, observation, method, config))
+            mesh = completed(model.field(steps[-1].code), observation, MeshConfig(resolution))
             yield compared(shape.name, method, points, mesh, solid.surface, sum(step.seconds for step in steps))
 
 
@@ -104,7 +104,7 @@ def compared(
 
 
 def summary(results: list[Result]) -> dict[str, dict[str, float]]:
-    """Mean, median and worst Chamfer of each method."""
+    """Returns mean, median and worst Chamfer distance of each method."""
     values = {
         method: np.array([result.chamfer for result in results if result.method == method])
         for method in dict.fromkeys(result.method for result in results)
@@ -116,14 +116,14 @@ def summary(results: list[Result]) -> dict[str, dict[str, float]]:
 
 
 def picture_of(results: list[Result]) -> Picture:
-    """Each shape as a row: the true surface, then what each method made of it."""
+    """Returns a row for each shape: the true surface, then that of each method."""
     rows = []
     for _, group in groupby(results, key=lambda result: result.shape):
         of_shape = list(group)
-        rows.append([drawn(mesh) for mesh in (of_shape[0].truth, *(result.mesh for result in of_shape))])
+        rows.append([rendered(mesh) for mesh in (of_shape[0].truth, *(result.mesh for result in of_shape))])
     return grid(rows)
 
 
-def drawn(mesh: trimesh.Trimesh) -> Picture:
-    """A mesh as the poster's camera sees it."""
+def rendered(mesh: trimesh.Trimesh) -> Picture:
+    """Renders a mesh from the poster's camera."""
     return pictured(Solid(mesh, mesh), poster_view(OBSERVATION_SIZE))

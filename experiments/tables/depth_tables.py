@@ -1,4 +1,4 @@
-"""The tables that trials of completion make, as rows and as pages: medians over instances, curves, and pictures."""
+"""Tables of completion trials, as rows and as pages: medians over instances, curves, and pictures."""
 
 from collections.abc import Sequence
 from statistics import median
@@ -16,7 +16,7 @@ from distrace.shading import Picture, grid
 from experiments.tables.sparse_depth import DENSITIES, SIZE, Done, camera_of, observed, surface_of, true_solid
 from experiments.tables.trials import Place, grouped
 
-PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than ours (Liu et al., CVPR 2020, table 3)
+PUBLISHED = {  # medians of 200 shapes of ShapeNet a class, not our shapes (Liu et al., CVPR 2020, table 3)
     ("sofa", "DeepSDF"): (5.37, 5.56, 5.50, 5.93, 6.03, 7.63),
     ("sofa", "DIST"): (4.12, 5.75, 5.49, 5.72, 5.57, 6.95),
     ("sofa", "DIST + mask"): (4.12, 3.98, 4.31, 3.98, 4.30, 4.94),
@@ -30,31 +30,31 @@ PUBLISHED = {  # medians of 200 instances of ShapeNet a class: other shapes than
 PICTURE = 176  # pixels
 _BLANK = np.full((PICTURE, PICTURE, 3), 255, np.uint8)
 AXES = {"sparse-depth": "density", "noise": "noise", "focal": "focal_ratio"}
-LABELS = {"density": "depths", "noise": "noise on the depths", "focal_ratio": "focal length, to 60 mm"}
+LABELS = {"density": "depths", "noise": "noise on the depths", "focal_ratio": "focal length / 60 mm"}
 
 
 def rows_of(results: Sequence[Done], axis: str) -> list[dict[str, object]]:
-    """One row for each class, method and step of the axis, in the order in which they were tried."""
+    """Returns one row for each class, method and step of the axis, in the order of the results."""
     groups = grouped(results, lambda each: (each.trial.category, each.trial.method, getattr(each.trial, axis)))
     return [
         {
             "class": category,
             "method": method,
-            "density": some[0].trial.density,
+            "density": group[0].trial.density,
             axis: step,
-            "chamfer_median": median(each.chamfer for each in some),
-            "chamfer_mean": sum(each.chamfer for each in some) / len(some),
-            "to_median": median(each.chamfer_to for each in some),
-            "from_median": median(each.chamfer_from for each in some),
-            "seconds": median(each.seconds for each in some),
-            "n": len(some),
+            "chamfer_median": median(each.chamfer for each in group),
+            "chamfer_mean": sum(each.chamfer for each in group) / len(group),
+            "to_median": median(each.chamfer_to for each in group),
+            "from_median": median(each.chamfer_from for each in group),
+            "seconds": median(each.seconds for each in group),
+            "n": len(group),
         }
-        for (category, method, step), some in groups.items()
+        for (category, method, step), group in groups.items()
     ]
 
 
 def wide(rows: Sequence[dict[str, object]], axis: str) -> tuple[list[str], list[list[str]]]:
-    """The medians as the published table has them: a line for each class and method, a column for each step."""
+    """Returns the medians in the published layout: a line for each class and method, a column for each step."""
     steps = list(dict.fromkeys(row[axis] for row in rows))
     medians = {(row["class"], row["method"], row[axis]): row["chamfer_median"] for row in rows}
     lines = list(dict.fromkeys((row["class"], row["method"]) for row in rows))
@@ -63,15 +63,15 @@ def wide(rows: Sequence[dict[str, object]], axis: str) -> tuple[list[str], list[
 
 
 def ratios(rows: Sequence[dict[str, object]], axis: str) -> dict[str, dict[str, float]]:
-    """Of each class: the median of each method over DeepSDF's, averaged over the steps."""
+    """Returns each class's median by each method over DeepSDF's, averaged over the steps."""
     found: dict[str, dict[str, float]] = {}
     for category in dict.fromkeys(str(row["class"]) for row in rows):
-        some = [row for row in rows if row["class"] == category]
-        base = {row[axis]: float(str(row["chamfer_median"])) for row in some if row["method"] == "deepsdf"}
-        for method in dict.fromkeys(str(row["method"]) for row in some):
+        of_class = [row for row in rows if row["class"] == category]
+        base = {row[axis]: float(str(row["chamfer_median"])) for row in of_class if row["method"] == "deepsdf"}
+        for method in dict.fromkeys(str(row["method"]) for row in of_class):
             shares = [
                 float(str(row["chamfer_median"])) / base[row[axis]]
-                for row in some
+                for row in of_class
                 if row["method"] == method and row[axis] in base
             ]
             if shares and method != "deepsdf":
@@ -80,7 +80,7 @@ def ratios(rows: Sequence[dict[str, object]], axis: str) -> dict[str, dict[str, 
 
 
 def depth_page(name: str, results: Sequence[Done], place: Place) -> str:
-    """Table, curves, and pictures of the best, the median and the worst."""
+    """Returns the page: table, curves, and pictures of the best, the median and the worst completion."""
     axis = AXES[name]
     rows = rows_of(results, axis)
     header, cells = wide(rows, axis)
@@ -88,13 +88,15 @@ def depth_page(name: str, results: Sequence[Done], place: Place) -> str:
     count = f"{counts[0]}" if min(counts) == max(counts) else f"{min(counts)} to {max(counts)}"
     lead = (
         "Median Chamfer distance × 1000, both directions summed, 30,000 points a side, in the frame of the unit sphere;"
-        f" {count} instances a cell. The shapes were not trained on; depths are Embree's, of their meshes."
+        f" {count} instances a cell. The shapes are held out; Embree renders the depths of their meshes."
     )
     mean_ratios = [
         f"{category}: " + ", ".join(f"{method} {ratio:.2f}" for method, ratio in methods.items())
         for category, methods in ratios(rows, axis).items()
     ]
-    against = [paragraph("Of DeepSDF's, averaged over columns: " + "; ".join(mean_ratios))] if mean_ratios else []
+    against = (
+        [paragraph("Relative to DeepSDF, averaged over columns: " + "; ".join(mean_ratios))] if mean_ratios else []
+    )
     parts = [
         section("Table", table(header, cells), *against),
         *(_curves(category, rows, axis) for category in dict.fromkeys(str(row["class"]) for row in rows)),
@@ -107,7 +109,9 @@ def depth_page(name: str, results: Sequence[Done], place: Place) -> str:
 
 def _published() -> Html:
     cells = [[*line, *map(str, values)] for line, values in PUBLISHED.items()]
-    about = "The published table (Liu et al., CVPR 2020): 200 shapes of ShapeNet a class. Other shapes: not comparable."
+    about = (
+        "The published table (Liu et al., CVPR 2020) has 200 other shapes of ShapeNet a class, so it is not comparable."
+    )
     return section("Published", paragraph(about), table(["class", "method", *DENSITIES], cells))
 
 
@@ -120,23 +124,23 @@ def _curves(category: str, rows: Sequence[dict[str, object]], axis: str) -> Html
 
 
 def _instances(results: Sequence[Done], place: Place) -> list[Html]:
-    """By the last method at the fourth step, where one is left, of each class."""
+    """Returns pictures of each class at the fourth step, ranked by ours with the mask or by the last method."""
     parts = []
     for category in dict.fromkeys(each.trial.category for each in results):
-        some = [each for each in results if each.trial.category == category]
-        conditions = list(dict.fromkeys(_condition(each) for each in some))
+        of_class = [each for each in results if each.trial.category == category]
+        conditions = list(dict.fromkeys(_condition(each) for each in of_class))
         condition = conditions[min(3, len(conditions) - 1)]
-        last = some[-1].trial.method if not any(e.trial.method == "ours+mask" for e in some) else "ours+mask"
+        methods = list(dict.fromkeys(each.trial.method for each in of_class))
+        ranking = "ours+mask" if "ours+mask" in methods else of_class[-1].trial.method
         ranked = sorted(
-            (each for each in some if _condition(each) == condition and each.trial.method == last),
+            (each for each in of_class if _condition(each) == condition and each.trial.method == ranking),
             key=lambda each: each.chamfer,
         )
         chosen = {"best": ranked[0], "median": ranked[len(ranked) // 2], "worst": ranked[-1]}
         caption = "; ".join(f"{word}: {each.trial.shape}, {each.chamfer:.2f}" for word, each in chosen.items())
-        methods = list(dict.fromkeys(each.trial.method for each in some))
-        picture = grid([_strip(each, some, methods, place) for each in chosen.values()])
+        picture = grid([_strip(each, of_class, methods, place) for each in chosen.values()])
         head = f"{category}, {', '.join(map(str, condition))}: the truth, then {', '.join(methods)}"
-        parts.append(section(head, figure(picture, f"By {last}: {caption}")))
+        parts.append(section(head, figure(picture, f"By {ranking}: {caption}")))
     return parts
 
 
@@ -145,20 +149,23 @@ def _condition(each: Done) -> tuple:
 
 
 def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Place) -> list[Picture]:
-    """The truth, and what each method made of the same view."""
+    """Returns the true shape, and each method's completion of the same view."""
     camera = camera_of(one.trial.view, one.trial.focal_ratio).resized(PICTURE / SIZE)
-    made = {
+    completions = {
         each.trial.method: each
         for each in results
         if (each.trial.shape, each.trial.view, _condition(each)) == (one.trial.shape, one.trial.view, _condition(one))
     }
     truth = pictured(true_solid(place.meshes, one.trial.category, one.trial.shape), camera)
-    return [truth, *(_shaded(made[method], camera, place) if method in made else _BLANK for method in methods)]
+    return [
+        truth,
+        *(_shaded(completions[method], camera, place) if method in completions else _BLANK for method in methods),
+    ]
 
 
 def _shaded(each: Done, camera: Camera, place: Place) -> Picture:
-    seen = told(observed(each.trial, place.meshes), each.trial.method)
-    surface = surface_of(place, each.trial, seen, torch.tensor(each.code))
+    observation = told(observed(each.trial, place.meshes), each.trial.method)
+    surface = surface_of(place, each.trial, observation, torch.tensor(each.code))
     return _BLANK if surface is None else pictured(Solid(surface, surface), camera)
 
 

@@ -1,4 +1,4 @@
-"""A shape fitted at one focal length, looked at through others: does what was never seen so look right?"""
+"""Renders a shape fitted at one focal length at all of them: is the surface right from new distances?"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,41 +16,44 @@ COARSER = 0.5  # × the resolution of the observations
 
 
 @dataclass(frozen=True)
-class Look:
-    """A completed shape seen at another focal length, against the true one."""
+class Rendering:
+    """The errors of a completed shape rendered at another focal length."""
 
     category: str
     method: str
     focal_ratio: float
-    depth_error: float  # median over the pixels where both are seen
+    depth_error: float  # median over the pixels where both hit
     iou: float  # of the silhouettes
 
 
 @torch.no_grad()
-def looks(place: Place, trial: Trial) -> list[Look]:
-    """At every focal length, from the direction of the observation."""
+def renderings_of(place: Place, trial: Trial) -> list[Rendering]:
+    """Renders a trial's shape at every focal length, from the direction of the observation."""
     field = place.field_of(trial.category, torch.tensor(done(place, trial).code))
-    truth, found = true_solid(place.meshes, trial.category, trial.shape), []
+    truth = true_solid(place.meshes, trial.category, trial.shape)
+    renderings = []
     for ratio in RATIOS:
         camera = camera_of(trial.view, ratio).resized(COARSER)
-        buffers, seen = render(field, camera.to(place.device)), observe(truth, camera)
-        errors = depth_errors(buffers.depth.cpu(), seen.depth)
+        buffers = render(field, camera.to(place.device))
+        observed = observe(truth, camera)
+        errors = depth_errors(buffers.depth.cpu(), observed.depth)
         error = errors.median().item() if len(errors) else float("inf")
-        found.append(Look(trial.category, trial.method, ratio, error, iou(buffers.mask.cpu(), seen.seen)))
-    return found
+        overlap = iou(buffers.mask.cpu(), observed.seen)
+        renderings.append(Rendering(trial.category, trial.method, ratio, error, overlap))
+    return renderings
 
 
-def look_rows(found: Sequence[Look]) -> list[dict[str, object]]:
-    """Medians of each class, method and focal length."""
-    groups = grouped(found, lambda each: (each.category, each.method, each.focal_ratio))
+def rendering_rows(renderings: Sequence[Rendering]) -> list[dict[str, object]]:
+    """Returns medians of each class, method and focal length."""
+    groups = grouped(renderings, lambda each: (each.category, each.method, each.focal_ratio))
     return [
         {
             "class": category,
             "method": method,
             "tested_at": ratio,
-            "depth_error_median": median(each.depth_error for each in some),
-            "iou_median": median(each.iou for each in some),
-            "n": len(some),
+            "depth_error_median": median(each.depth_error for each in group),
+            "iou_median": median(each.iou for each in group),
+            "n": len(group),
         }
-        for (category, method, ratio), some in groups.items()
+        for (category, method, ratio), group in groups.items()
     ]

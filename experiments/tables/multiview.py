@@ -1,7 +1,7 @@
-"""Held-out shapes from clips, no depth, no masks: against masks alone, the training shapes, and classical stereo.
+"""Held-out shapes from clips without depth or masks, against true masks, training shapes, and classical stereo.
 
-The protocol is DIST's (Liu et al., CVPR 2020, section 4.3): cameras are known, the code is not; and beside it the
-shape's place, too, is off at first.
+The protocol is DIST's (Liu et al., CVPR 2020, section 4.3): the cameras are given, and the code is fitted. A second
+method starts from a disturbed placement.
 """
 
 import json
@@ -40,25 +40,25 @@ from experiments.tables.trials import fingerprint, grouped, hash_of, opened_once
 
 METHODS = ("nearest", "silhouettes", "stereo", "ours", "ours, moved")
 MOVED_BY = (10.0, 0.1, 0.1)  # degrees, radii, and part of the size
-RECOVERED = (2.0, 0.02, 0.02)  # a fifth of that: to so much, the place counts as found again
-REGISTERED = 10_000  # points of each surface, for what a registration would still move
+RECOVERED = (2.0, 0.02, 0.02)  # a fifth of that: errors up to which the placement counts as found
+REGISTERED = 10_000  # points of each surface, for the registration
 RESOLUTION = 192
 
-Surface = trimesh.Trimesh | np.ndarray  # or points of it
+Surface = trimesh.Trimesh | np.ndarray  # a mesh or points
 
 
 @dataclass(frozen=True)
 class ClipTrial:
-    """A clip as `distrace clip` leaves it, and who finds the shape in it."""
+    """A clip made by `python -m experiments clip`, and the method that fits it."""
 
     folder: Path
     method: str
     meshes: Path
     out: Path
-    model: str | None = None  # by default that of the clip's split
+    model: str | None = None  # by default the one of the clip's split
 
     def file(self, suffix: str) -> Path:
-        """What the trial leaves: its figures (.json), and its surface (.ply)."""
+        """Returns the path of the trial's figures (.json) or surface (.ply)."""
         clip = described(self.folder)
         name = "_".join((clip["shape"], clip["background"], clip["texture"], self.method))
         return self.out / "trials" / f"{name}{suffix}"
@@ -66,7 +66,7 @@ class ClipTrial:
 
 @dataclass(frozen=True)
 class ClipResult:
-    """How far the found surface is from the true one, in the world; and how it would best be moved there."""
+    """The distance of the fitted surface from the true one, in the world, and the motion that aligns them best."""
 
     category: str
     shape: str
@@ -79,7 +79,7 @@ class ClipResult:
     degrees: float
     shift: float
     growth: float
-    code: list[float]  # of stereo, none
+    code: list[float]  # empty for stereo
 
     @property
     def chamfer(self) -> float:
@@ -90,32 +90,34 @@ class ClipResult:
         return all(off <= limit for off, limit in zip((self.degrees, self.shift, self.growth), RECOVERED, strict=True))
 
     def row(self) -> dict[str, object]:
-        """All but the code."""
+        """Returns all fields but the code."""
         return {name: value for name, value in asdict(self).items() if name != "code"}
 
 
 def clip_done(trial: ClipTrial) -> ClipResult:
-    """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
+    """Returns a trial's result, read from the file of a run with the same model and settings, or computed and saved."""
     clip = described(trial.folder)
     model = opened_once(trial.model or clip["split"])
     mark = fingerprint(model, tuple(sorted(clip.items())), settings_of(trial.method))
     if trial.file(".json").is_file() and trial.file(".ply").is_file():
-        kept = read_json(trial.file(".json"))
-        if kept.pop("made_by", None) == mark:
-            return ClipResult(**kept)
-    began, code = time.perf_counter(), torch.zeros(0)
+        content = read_json(trial.file(".json"))
+        if content.pop("made_by", None) == mark:
+            return ClipResult(**content)
+    start = time.perf_counter()
+    code = torch.zeros(0)
     if trial.method == "stereo":
         surface: Surface = stereo_points(load_photographs(trial.folder).views)
-        seconds = time.perf_counter() - began
+        seconds = time.perf_counter() - start
     else:
-        code, place = _found(trial, model, clip)
-        seconds = time.perf_counter() - began
+        code, place = _fitted(trial, model, clip)
+        seconds = time.perf_counter() - start
         surface = extract_mesh(model.field(code), MeshConfig(RESOLUTION))
         surface.apply_transform(place.T_world_object.numpy())
     true = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
-    distance, off = chamfer(surface, true), left_over(surface, true)
+    distance = chamfer(surface, true)
+    motion = remaining_motion(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
-    result = ClipResult(*names, distance.to, distance.from_, seconds, *off, [round(x, 6) for x in code.tolist()])
+    result = ClipResult(*names, distance.to, distance.from_, seconds, *motion, [round(x, 6) for x in code.tolist()])
     with written(trial.file(".ply")) as file:
         (trimesh.PointCloud(surface) if isinstance(surface, np.ndarray) else surface).export(file, file_type="ply")
     save_json(trial.file(".json"), {"made_by": mark, **asdict(result)})
@@ -123,63 +125,65 @@ def clip_done(trial: ClipTrial) -> ClipResult:
 
 
 def surface_of(trial: ClipTrial) -> Surface:
-    """What a trial that is done has found."""
-    found: Any = trimesh.load(trial.file(".ply"), process=False)
-    return found if isinstance(found, trimesh.Trimesh) else np.asarray(found.vertices)
+    """Returns the surface of a finished trial."""
+    surface: Any = trimesh.load(trial.file(".ply"), process=False)
+    return surface if isinstance(surface, trimesh.Trimesh) else np.asarray(surface.vertices)
 
 
-def left_over(surface: Surface, true: trimesh.Trimesh) -> tuple[float, float, float]:
-    """What a similarity by iterative closest points still moves a surface by: degrees, radii, and part of its size.
+def remaining_motion(surface: Surface, true: trimesh.Trimesh) -> tuple[float, float, float]:
+    """Returns the similarity that aligns a surface by iterative closest points: degrees, radii, and share of its size.
 
-    A code can make a shape larger and the place smaller: neither is right or wrong alone.
+    Code and placement can compensate each other in size, so neither is right or wrong alone.
     """
     points = surface if isinstance(surface, np.ndarray) else surface_points(surface, REGISTERED, seed=0)
-    goal = surface_points(true, REGISTERED, seed=1)
-    kept = {"threshold": 1e-9, "max_iterations": 100, "reflection": False}
-    matrix = torch.from_numpy(trimesh.registration.icp(points, goal, **kept)[0]).float()
+    target = surface_points(true, REGISTERED, seed=1)
+    options = {"threshold": 1e-9, "max_iterations": 100, "reflection": False}
+    matrix = torch.from_numpy(trimesh.registration.icp(points, target, **options)[0]).float()
     scale = matrix[:3, :3].det().abs() ** (1 / 3)
     step = Similarity(matrix[:3, :3] / scale, matrix[:3, 3], scale).step_from(Similarity.identity())
     return math.degrees(float(step[:3].norm())), float(step[3:6].norm()), abs(math.expm1(float(step[6])))
 
 
 def described(folder: Path) -> dict[str, Any]:
-    """What `clip.json` says; raises `ValueError` for a folder without one."""
+    """Returns `clip.json`. Raises `ValueError` for a folder without one."""
     path = folder / "clip.json"
-    with explained(f"{path} is no description of a clip; `distrace clip SHAPE` makes one"):
+    with explained(f"{path} is no description of a clip; `python -m experiments clip SHAPE` makes one"):
         return dict(json.loads(path.read_text(encoding="utf-8")))
 
 
 def settings_of(method: str) -> object:
-    """What a method follows; raises `ValueError` for another one."""
+    """Returns the settings of a method. Raises `ValueError` for an unknown one."""
     if method not in METHODS:
-        raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS)}")
-    own = {"silhouettes": CodeFitConfig(), "stereo": None}
-    return own.get(method, (method, _config(method), MOVED_BY))
+        raise ValueError(f"there is no method {method!r}; choose from {', '.join(METHODS)}")
+    by_method = {"silhouettes": CodeFitConfig(), "stereo": None}
+    return by_method.get(method, (method, _config(method), MOVED_BY))
 
 
 def _config(method: str) -> PhotoConfig:
-    """How a method looks at photographs."""
+    """Returns the configuration of a method that uses photographs."""
     return UNKNOWN_PLACE if "moved" in method else KNOWN_PLACE
 
 
-def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], Similarity]:
-    """The code, and the place."""
-    prior, still, config = prior_of(model.codes), Similarity.identity(), _config(trial.method)
+def _fitted(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[Tensor, "length"], Similarity]:
+    """Returns the code and the placement."""
+    prior = prior_of(model.codes)
+    identity = Similarity.identity()
+    config = _config(trial.method)
     views = list(load_photographs(trial.folder).views)
     if trial.method == "silhouettes":
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
-        return step.code, still
+        return step.code, identity
     if trial.method == "nearest":
         stage = Stage.of(views, config.levels[0], config.compared)
-        best = Search(model.decoder, prior).ranked(stage, config.compared, still)[0]
-        return prior.code(best[1]), still
-    place = disturbed(hash_of(clip["shape"])) if config.compared.moves else still
+        best = Search(model.decoder, prior).ranked(stage, config.compared, identity)[0]
+        return prior.code(best[1]), identity
+    place = disturbed(hash_of(clip["shape"])) if config.compared.moves else identity
     *_, last = fit_photos(model.decoder, views, prior, config, place)
     return last.code, last.place
 
 
 def disturbed(seed: int) -> Similarity:
-    """A place that is off by `MOVED_BY`, to all sides alike."""
+    """Returns a placement that is off by `MOVED_BY`, in a random direction."""
     random = torch.Generator().manual_seed(seed)
     axis, shift = torch.nn.functional.normalize(torch.randn(2, 3, generator=random), dim=-1)
     growth = torch.tensor([math.log1p(MOVED_BY[2])]) * (1 - 2 * torch.randint(2, (1,), generator=random))
@@ -188,24 +192,24 @@ def disturbed(seed: int) -> Similarity:
 
 
 def _silhouette(folder: Path, view: Photograph) -> View:
-    """The true mask of a frame, and nothing else."""
+    """Returns the true mask of a frame as an observation."""
     mask = read_mask(folder / "truth" / "masks" / f"{view.name}.png")
     return View(view.camera, torch.full(mask.shape, torch.inf), mask)
 
 
 def multiview_rows(results: Sequence[ClipResult]) -> list[dict[str, object]]:
-    """Medians of each class, background and method."""
+    """Returns medians of each class, background and method."""
     groups = grouped(results, lambda each: (each.category, each.background, each.method))
     return [
         {
             "class": category,
             "background": background,
             "method": method,
-            "chamfer_from_truth": median(each.chamfer_from for each in some),
-            "chamfer": median(each.chamfer for each in some),
-            "seconds": median(each.seconds for each in some),
-            **({"recovered": sum(each.recovered for each in some) / len(some)} if "moved" in method else {}),
-            "n": len(some),
+            "chamfer_from_truth": median(each.chamfer_from for each in group),
+            "chamfer": median(each.chamfer for each in group),
+            "seconds": median(each.seconds for each in group),
+            **({"recovered": sum(each.recovered for each in group) / len(group)} if "moved" in method else {}),
+            "n": len(group),
         }
-        for (category, background, method), some in groups.items()
+        for (category, background, method), group in groups.items()
     ]

@@ -1,4 +1,4 @@
-"""How often a disturbed camera is found again: the protocol, its rows, and its page."""
+"""The share of disturbed cameras that are found: protocol, rows and page."""
 
 import json
 from collections.abc import Sequence
@@ -23,12 +23,13 @@ from experiments.tables.trials import opened_once
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST
 DISTURBANCES = (SIGMA, "10°", "20°", "40°", "60°")  # with a shift by a tenth of the distance
 OBSERVATIONS = ("depth+silhouette", "depth", "silhouette", "depth+silhouette+normal", "normal")
-PARTS = {"depth": "depth", "silhouette": "mask", "normal": "normal"}  # of a view, by what they are called
+PARTS = {"depth": "depth", "silhouette": "mask", "normal": "normal"}  # names of a view's parts
 FOCAL = "depth+silhouette, focal length off by 20 %"
-PROTOCOL = [(seen, by) for seen in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
+PROTOCOL = [(observation, by) for observation in OBSERVATIONS for by in DISTURBANCES] + [(FOCAL, "10°")]
 SIZE = 192  # pixels
-FIRST_SEED = 1000  # no camera that the search was tuned on
-DEGREES, PERCENT = 0.5, 0.5  # within which a camera is found
+FIRST_SEED = 1000  # of cameras that the fit was not tuned on
+DEGREES = 0.5  # largest error of rotation
+PERCENT = 0.5  # largest error of translation, of the distance
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Found:
-    """How far the camera that was found is off."""
+    """The errors of the fitted camera."""
 
     trial: Trial
     degrees: float
@@ -62,10 +63,11 @@ class Found:
 
 
 def all_trials(cameras: int) -> list[Trial]:
-    """The whole protocol, of one camera after the other; depth with silhouette goes before the rest.
+    """Returns the whole protocol, camera by camera; depth with silhouette comes first.
 
-    The focal length is searched for from the mildest turn."""
-    trials = [Trial(seen, by, k) for k in range(cameras) for seen, by in PROTOCOL]
+    The focal length is fitted from the mildest rotation only.
+    """
+    trials = [Trial(observation, by, k) for k in range(cameras) for observation, by in PROTOCOL]
     return sorted(trials, key=lambda trial: trial.observation not in (OBSERVATIONS[0], FOCAL))
 
 
@@ -74,15 +76,15 @@ def write_trials(path: Path, model: str, done: Sequence[Found]) -> None:
 
 
 def read_trials(path: Path, model: str) -> list[Found]:
-    """Those of an earlier run; none where there is no file. Raises `ValueError` for those of another model."""
+    """Returns the trials of a file, none without a file. Raises `ValueError` for those of another model."""
     if not path.is_file():
         return []
-    with explained(f"{path} holds no trials; remove it to begin anew"):
-        kept = json.loads(path.read_text())
-        done = [Found(Trial(*(row.pop(part.name) for part in fields(Trial))), **row) for row in kept["trials"]]
-        whose = str(kept["model"])
-    if whose != model:
-        raise ValueError(f"{path} holds trials of {whose}, not of {model}; give another --out")
+    with explained(f"{path} holds no trials; remove it to start again"):
+        content = json.loads(path.read_text())
+        done = [Found(Trial(*(row.pop(part.name) for part in fields(Trial))), **row) for row in content["trials"]]
+        owner = str(content["model"])
+    if owner != model:
+        raise ValueError(f"{path} holds trials of {owner}, not of {model}; give another --out")
     return done
 
 
@@ -95,7 +97,8 @@ def found(model: str, trial: Trial) -> Found:
         buffers = render(field, camera)
         view = View(camera, buffers.depth, buffers.mask, buffers.normal)
     view = view.without(*(part for name, part in PARTS.items() if name not in trial.observation))
-    start, focal = disturbed(camera, trial.disturbance, random), trial.observation == FOCAL
+    start = disturbed(camera, trial.disturbance, random)
+    focal = trial.observation == FOCAL
     if focal:
         start = zoomed(start, torch.tensor(1.2 if trial.camera % 2 else 0.8).log())
     steps = list(fit_camera(field, view, start, CameraConfig(focal=focal)))
@@ -114,58 +117,63 @@ def found(model: str, trial: Trial) -> Found:
 
 
 def random_camera(random: torch.Generator) -> Camera:
-    """From all around, a little from below to half above, at 3.5 to 5.5 radii."""
+    """Returns a camera at a random azimuth, elevations from −10° to 50°, and 3.5 to 5.5 radii."""
     azimuth, elevation, distance = torch.rand(3, generator=random).tolist()
     return Camera.orbit(360 * azimuth, 60 * elevation - 10, 3.5 + 2 * distance, height=SIZE, width=SIZE)
 
 
 def disturbed(camera: Camera, how: str, random: torch.Generator) -> Camera:
-    """Noise on quaternion and translation; or a turn by so many degrees and a shift by a tenth of the distance."""
+    """Returns the camera with noise on quaternion and translation, or rotated by `how` and shifted by a tenth."""
     rotation, translation = object_in_camera(camera)
     if how == SIGMA:
         noise = 0.1 * torch.randn(7, generator=random)
         quaternion = roma.rotmat_to_unitquat(rotation) + noise[:4]
         return with_object_at(camera, roma.unitquat_to_rotmat(quaternion / quaternion.norm()), translation + noise[4:])
-    axis, aside = (each / each.norm() for each in torch.randn(2, 3, generator=random))
-    turn = torch.deg2rad(torch.tensor(float(how.removesuffix("°"))))
-    return turned_object(camera, axis * turn, aside * translation.norm() / 10)
+    axis, shift = (each / each.norm() for each in torch.randn(2, 3, generator=random))
+    angle = torch.deg2rad(torch.tensor(float(how.removesuffix("°"))))
+    return turned_object(camera, axis * angle, shift * translation.norm() / 10)
 
 
 def rows_of(model: str, done: Sequence[Found]) -> list[dict[str, object]]:
-    """One row for each observation and disturbance."""
+    """Returns one row for each observation and disturbance."""
     rows = []
     for observation, disturbance in PROTOCOL:
-        some = [each for each in done if (each.trial.observation, each.trial.disturbance) == (observation, disturbance)]
-        if not some:
+        of_row = (observation, disturbance)
+        group = [each for each in done if (each.trial.observation, each.trial.disturbance) == of_row]
+        if not group:
             continue
         rows.append(
             {
                 "model": model,
                 "observation": observation,
                 "disturbance": disturbance,
-                "success": sum(each.success for each in some) / len(some),
-                "rotation_median_degrees": median(each.degrees for each in some),
-                "translation_median_percent": median(each.percent for each in some),
-                "focal_median_percent": median(each.focal_percent for each in some),
-                "starts": sum(each.starts for each in some) / len(some),
-                "seconds": median(each.seconds for each in some),
-                "n": len(some),
+                "success": sum(each.success for each in group) / len(group),
+                "rotation_median_degrees": median(each.degrees for each in group),
+                "translation_median_percent": median(each.percent for each in group),
+                "focal_median_percent": median(each.focal_percent for each in group),
+                "starts": sum(each.starts for each in group) / len(group),
+                "seconds": median(each.seconds for each in group),
+                "n": len(group),
             }
         )
     return rows
 
 
 def pose_page(model: str, rows: Sequence[dict[str, object]]) -> str:
-    """The table, and the share of cameras found against how far the start was off."""
+    """Returns the page: the table, and the share of cameras found against the disturbance."""
     cells = [[short(value) for key, value in row.items() if key != "model"] for row in rows]
     series = {
-        seen: {str(row["disturbance"]): 100 * float(str(row["success"])) for row in rows if row["observation"] == seen}
-        for seen in dict.fromkeys(str(row["observation"]) for row in rows)
+        observation: {
+            str(row["disturbance"]): 100 * float(str(row["success"]))
+            for row in rows
+            if row["observation"] == observation
+        }
+        for observation in dict.fromkeys(str(row["observation"]) for row in rows)
     }
     lead = (
         f"Cameras around the training shapes of {model}, {SIZE} × {SIZE} pixels. Found: within {DEGREES}° and"
         f" {PERCENT} % of the distance. Starts: N(0, 0.1²) on each entry of quaternion and translation, as in DIST; or"
-        " turned about a random axis, and shifted by 10 % of the distance."
+        " rotated about a random axis, and shifted by 10 % of the distance."
     )
     return page(
         f"Camera from one view: {model}",
@@ -173,6 +181,6 @@ def pose_page(model: str, rows: Sequence[dict[str, object]]) -> str:
         [
             section("Share of cameras found", steps_chart(series, "disturbance of the start", "found, %")),
             section("Table", table([key for key in rows[0] if key != "model"], cells)),
-            paragraph("Seconds are those of one process with one thread, others beside it."),
+            paragraph("Seconds are of one thread, with other processes running."),
         ],
     )

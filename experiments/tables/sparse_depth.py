@@ -1,6 +1,6 @@
 """The published experiment: held-out shapes from ever fewer depths of one view (Liu et al., CVPR 2020, section 4.2).
 
-The same trials, with noise on the depths or at other focal lengths, make its two neighbours.
+Trials with noise on the depths, or at other focal lengths, make two more tables.
 """
 
 import math
@@ -31,14 +31,17 @@ from experiments.tables.trials import Place, fingerprint, hash_of, read_json
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
 RATIOS = (0.5, 0.71, 1.0, 1.41, 2.0)  # of focal lengths to the usual one
 AZIMUTHS_ELEVATIONS = ((30, 20), (150, 30), (225, 40), (330, 10))
-SIZE, FOCAL_MM, SENSOR_MM = 256, 60.0, 32.0
+SIZE = 256
+FOCAL_MM = 60.0
+SENSOR_MM = 32.0
 DISTANCE = 4.97  # at the usual focal length
-NOISY_DENSITY = "10%"  # of the depths that noise and focal lengths are tried on
+EMPTY = np.zeros((1, 3))  # one point in the middle stands for an empty surface
+NOISY_DENSITY = "10%"  # of the depths, for the tables of noise and of focal lengths
 
 
 @dataclass(frozen=True)
 class Trial:
-    """One shape, one view of it, what is known of that, and who completes it."""
+    """A shape, a view of it, the observed part of the view, and the method that completes it."""
 
     category: str  # a split, and the model trained on it
     shape: str
@@ -56,7 +59,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Done:
-    """How far the completed surface is from the true one."""
+    """The distance of the completed surface from the true one."""
 
     trial: Trial
     chamfer_to: float
@@ -70,12 +73,10 @@ class Done:
         return self.chamfer_to + self.chamfer_from
 
     def row(self) -> dict[str, object]:
-        """All but the code."""
-        return {key: round(value, 4) if isinstance(value, float) else value for key, value in self._flat().items()}
-
-    def _flat(self) -> dict[str, object]:
+        """Returns all fields but the code, those of the trial included."""
         own = {name: value for name, value in asdict(self).items() if name not in ("trial", "code")}
-        return asdict(self.trial) | own
+        fields = asdict(self.trial) | own
+        return {key: round(value, 4) if isinstance(value, float) else value for key, value in fields.items()}
 
 
 def sparse_conditions() -> list[dict]:
@@ -96,7 +97,7 @@ CONDITIONS = {"sparse-depth": sparse_conditions, "noise": noise_conditions, "foc
 def all_trials(
     categories: Sequence[str], methods: Sequence[str], conditions: Sequence[dict], shapes: int | None, views: int
 ) -> list[Trial]:
-    """Of all held-out shapes, or of some evenly spread over the list; all of them from one view, then from the next."""
+    """Returns the trials of all held-out shapes, or of `shapes` evenly spread ones, view by view."""
     chosen = [(category, shape.name) for category in categories for shape in held_out(category, shapes)]
     return [
         Trial(category, shape, view, method, **condition)
@@ -108,7 +109,7 @@ def all_trials(
 
 
 def held_out(category: str, count: int | None = None) -> list[Shape]:
-    """A split's shapes to test on; `count` of them, evenly spread."""
+    """Returns a split's held-out shapes; `count` of them, evenly spread."""
     shapes = on_side("test", category)
     if count is None or count >= len(shapes):
         return shapes
@@ -116,7 +117,7 @@ def held_out(category: str, count: int | None = None) -> list[Shape]:
 
 
 def camera_of(view: int, focal_ratio: float = 1.0) -> Camera:
-    """At another focal length from as far as lets the unit sphere fill as much of the image."""
+    """Returns a camera, at a distance from which the unit sphere fills the same part of the image."""
     azimuth, elevation = AZIMUTHS_ELEVATIONS[view]
     distance = math.sqrt(1 + focal_ratio**2 * (DISTANCE**2 - 1))
     return Camera.orbit(
@@ -125,7 +126,7 @@ def camera_of(view: int, focal_ratio: float = 1.0) -> Camera:
 
 
 def observed(trial: Trial, meshes: Path) -> View:
-    """What is known in a trial, and the true normals and mask with it."""
+    """Returns the observation of a trial, with true normals and mask."""
     seed = 4 * hash_of(trial.shape) + trial.view
     view = observe(true_solid(meshes, trial.category, trial.shape), camera_of(trial.view, trial.focal_ratio))
     view = noisy(view, trial.noise, seed)
@@ -137,19 +138,21 @@ def observed(trial: Trial, meshes: Path) -> View:
 
 
 def done(place: Place, trial: Trial) -> Done:
-    """A trial's result: that of an earlier run with the same model and settings, or a new one, left in a file."""
-    path, model, config = place.out / "trials" / trial.file, place.model_of(trial.category), CodeFitConfig()
+    """Returns a trial's result, read from the file of a run with the same model and settings, or computed and saved."""
+    path = place.out / "trials" / trial.file
+    model = place.model_of(trial.category)
+    config = CodeFitConfig()
     mark = fingerprint(model, place.resolution, *settings_of(trial.method, config))
     if path.is_file():
-        kept = read_json(path)
-        if kept.pop("made_by", None) == mark:
-            return Done(Trial(**kept.pop("trial")), **kept)
-    seen = told(observed(trial, place.meshes), trial.method)
-    steps = list(steps_of(model, seen, trial.method, config))
+        content = read_json(path)
+        if content.pop("made_by", None) == mark:
+            return Done(Trial(**content.pop("trial")), **content)
+    observation = told(observed(trial, place.meshes), trial.method)
+    steps = list(steps_of(model, observation, trial.method, config))
     code = steps[-1].code
-    found = surface_of(place, trial, seen, code)
+    surface = surface_of(place, trial, observation, code)
     truth = true_solid(place.meshes, trial.category, trial.shape).surface
-    distance = chamfer(_nothing() if found is None else found, truth)
+    distance = chamfer(EMPTY if surface is None else surface, truth)
     result = Done(
         trial,
         distance.to,
@@ -162,20 +165,17 @@ def done(place: Place, trial: Trial) -> Done:
     return result
 
 
-def surface_of(place: Place, trial: Trial, seen: View | Cloud, code: Float[Tensor, "length"]) -> trimesh.Trimesh | None:
-    """What a trial's code makes of what was seen; none where it has no surface."""
+def surface_of(
+    place: Place, trial: Trial, observation: View | Cloud, code: Float[Tensor, "length"]
+) -> trimesh.Trimesh | None:
+    """Returns the completed mesh of a trial's code, or None where it has no surface."""
     try:
-        return completed(place.field_of(trial.category, code), seen, place.mesh)
+        return completed(place.field_of(trial.category, code), observation, place.mesh)
     except ValueError:
         return None
 
 
-def _nothing() -> np.ndarray:
-    """What an empty surface is compared as: one point in the middle."""
-    return np.zeros((1, 3))
-
-
 @lru_cache(maxsize=4)
 def true_solid(meshes: Path, category: str, name: str) -> Solid:
-    """A shape of a split; looked for once."""
+    """Returns the solid of a shape of a split; cached."""
     return solid_of(shape_of(category, name), meshes)

@@ -1,4 +1,4 @@
-"""Near-variants among shapes: of each held-out one the nearest that was trained on, and all pairs that are close."""
+"""Near-variants among shapes: the nearest neighbour of each, and the nearest training shape of held-out ones."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ POINTS = 4000  # of each shape
 
 @dataclass(frozen=True)
 class Near:
-    """Two shapes, and how far apart they are."""
+    """A shape and its nearest neighbours."""
 
     shape: str
     split: str
@@ -26,52 +26,52 @@ class Near:
     nearest: str  # of another design
     nearest_split: str
     chamfer: float
-    nearest_trained: str  # for a held-out shape, of those trained on
+    nearest_trained: str  # among the training shapes of other designs
     chamfer_trained: float
 
 
 def used(shapes: list[Shape]) -> list[Shape]:
-    """Those on either side."""
+    """Returns the training and the held-out shapes."""
     return [shape for shape in shapes if shape.split != "out"]
 
 
-def nearest_rows(shapes: list[Shape], meshes: Path, tell: Callable[[str], None]) -> list[Near]:
-    """One row for each shape, the closest pairs first."""
+def nearest_rows(shapes: list[Shape], meshes: Path, report: Callable[[str], None]) -> list[Near]:
+    """Returns one row for each shape, the closest pairs first."""
     trees = []
     for shape in shapes:
         trees.append(KDTree(_points(shape, meshes)))
-        tell(shape.name)
-    apart = np.array([[_apart(one, other) for other in trees] for one in trees])
-    apart = apart + apart.T
-    return sorted((_near(k, shapes, apart) for k in range(len(shapes))), key=lambda near: near.chamfer)
+        report(shape.name)
+    distances = np.array([[_one_sided(first, second) for second in trees] for first in trees])
+    distances = distances + distances.T
+    return sorted((_near(k, shapes, distances) for k in range(len(shapes))), key=lambda near: near.chamfer)
 
 
-def _near(k: int, shapes: list[Shape], apart: np.ndarray) -> Near:
-    other = np.array([shape.design != shapes[k].design for shape in shapes])
-    trained = other & np.array([shape.split == "train" for shape in shapes])
-    first, learnt = (int(np.where(which, apart[k], np.inf).argmin()) for which in (other, trained))
-    near, known = shapes[first], shapes[learnt]
+def _near(k: int, shapes: list[Shape], distances: np.ndarray) -> Near:
+    other_design = np.array([shape.design != shapes[k].design for shape in shapes])
+    trained = other_design & np.array([shape.split == "train" for shape in shapes])
+    nearest = int(np.where(other_design, distances[k], np.inf).argmin())
+    nearest_trained = int(np.where(trained, distances[k], np.inf).argmin())
     shape = shapes[k]
     return Near(
         shape.name,
         shape.split,
         shape.design,
-        near.name,
-        near.split,
-        round(float(apart[k, first]), 3),
-        known.name,
-        round(float(apart[k, learnt]), 3),
+        shapes[nearest].name,
+        shapes[nearest].split,
+        round(float(distances[k, nearest]), 3),
+        shapes[nearest_trained].name,
+        round(float(distances[k, nearest_trained]), 3),
     )
 
 
 def _points(shape: Shape, meshes: Path) -> Float[np.ndarray, "n 3"]:
-    """Of all faces: good enough to tell shapes apart, and quick."""
+    """Samples all faces, inner ones included: fast, and accurate enough to compare shapes."""
     mesh = normalised(load_soup(mesh_of(shape, meshes)))
     mesh.apply_transform(trimesh.transformations.rotation_matrix(np.radians(shape.turn), [0, 1, 0]))
     return surface_points(mesh, POINTS, seed=0)
 
 
-def _apart(one: KDTree, other: KDTree) -> float:
-    """One direction of the Chamfer distance × 1000."""
-    distances, _ = one.query(other.data)
+def _one_sided(tree: KDTree, other: KDTree) -> float:
+    """Returns one direction of the Chamfer distance × 1000."""
+    distances, _ = tree.query(other.data)
     return float(1000 * np.mean(distances**2))

@@ -1,4 +1,4 @@
-"""Whether completions that differ say where they are wrong: the spread of several against the error of one."""
+"""Correlates the spread of several completions with the error of one."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -21,44 +21,47 @@ from distrace.processes import each_done
 from experiments.tables.sparse_depth import camera_of, true_solid
 from experiments.tables.trials import hash_of, opened_once
 
-COMPLETIONS = 6  # whose spread is taken
-POINTS = 100  # observed depths, besides the silhouette
-LOOKED_AT = 5000  # points of the completed surface
+COMPLETIONS = 6  # that the spread is taken over
+POINTS = 100  # observed depths, in addition to the silhouette
+SURFACE_POINTS = 5000  # of the completed surface
 
 
 @dataclass(frozen=True)
 class SpreadRow:
-    """A held-out shape seen once: the rank correlation of spread and error over its completed surface."""
+    """The rank correlation of spread and error over the completed surface of a held-out shape."""
 
     category: str
     shape: str
     correlation: float
-    error_calm: float  # mean distance to the true surface of the half of it where completions agree best …
-    error_apart: float  # … and of the other half
+    error_calm: float  # mean distance to the true surface, on the half where completions agree best
+    error_apart: float  # the same on the other half
     chamfer: float
     seconds: float  # of all completions
 
 
 def spread_rows(category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
-    """Each of the shapes of a split."""
+    """Yields a row for each shape."""
     return each_done(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
-    opened, truth, seed = opened_once(model), true_solid(meshes, category, name), hash_of(name)
+    network = opened_once(model)
+    truth = true_solid(meshes, category, name)
+    seed = hash_of(name)
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
-    steps = list(completing(opened, view, CodeFitConfig()))
-    others = list(plausible(opened, view, COMPLETIONS, seed=seed))
-    mesh = completed(opened.field(steps[-1].code), view, MeshConfig())
-    points = surface_points(mesh, LOOKED_AT, seed=0)
-    apart = spread(opened, [step.code for step in others], torch.tensor(points, dtype=torch.float32)).numpy()
-    error, calm = truth.apart(points), apart < np.median(apart)
+    steps = list(completing(network, view, CodeFitConfig()))
+    samples = list(plausible(network, view, COMPLETIONS, seed=seed))
+    mesh = completed(network.field(steps[-1].code), view, MeshConfig())
+    points = surface_points(mesh, SURFACE_POINTS, seed=0)
+    deviation = spread(network, [step.code for step in samples], torch.tensor(points, dtype=torch.float32)).numpy()
+    error = truth.apart(points)
+    calm = deviation < np.median(deviation)
     return SpreadRow(
         category,
         name,
-        float(np.corrcoef(rankdata(apart), rankdata(error))[0, 1]),
+        float(np.corrcoef(rankdata(deviation), rankdata(error))[0, 1]),
         float(error[calm].mean()),
         float(error[~calm].mean()),
         chamfer(mesh, truth.surface).sum,
-        sum(step.seconds for step in (*steps, *others)),
+        sum(step.seconds for step in (*steps, *samples)),
     )

@@ -1,4 +1,4 @@
-"""Experiments of many trials that do not depend on each other: they go on where they were stopped."""
+"""Experiments of many independent trials, which resume after a stop."""
 
 import hashlib
 import json
@@ -22,16 +22,16 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Place:
-    """Where meshes, models and results lie."""
+    """The folders of meshes and results, and the models."""
 
     meshes: Path  # a folder for each source, as `distrace data` makes them
     out: Path
     models: tuple[tuple[str, str], ...]  # of each category
     resolution: int = 192  # of the meshes that are compared
-    device: torch.device = torch.device("cpu")  # where shapes are completed
+    device: torch.device = torch.device("cpu")  # of the fits
 
     def __post_init__(self) -> None:
-        _ = self.mesh  # before any fit, raises for what no mesh has
+        _ = self.mesh  # raises for an invalid resolution before any fit
 
     @property
     def mesh(self) -> MeshConfig:
@@ -41,12 +41,12 @@ class Place:
         return opened_once(dict(self.models)[category], self.device)
 
     def field_of(self, category: str, code: Float[Tensor, "length"]) -> SDF:
-        """On the device, wherever the code is."""
+        """Returns the field of a code, on the device."""
         return self.model_of(category).field(code.to(self.device))
 
 
 def grouped(results: Iterable[Result], key: Callable[[Result], tuple]) -> dict[tuple, list[Result]]:
-    """Results of one key together, in the order in which the keys first come."""
+    """Returns the results by key, in the order of the keys' first results."""
     groups: dict[tuple, list[Result]] = {}
     for each in results:
         groups.setdefault(key(each), []).append(each)
@@ -55,19 +55,19 @@ def grouped(results: Iterable[Result], key: Callable[[Result], tuple]) -> dict[t
 
 @cache
 def opened_once(name: str, device: torch.device = torch.device("cpu")) -> Model:
-    """A model, read once by each process."""
+    """Returns a model; each process reads it once."""
     return load_model(name).to(device)
 
 
 def read_json(path: Path) -> Any:
-    """What a trial left. Raises `ValueError` for a file that is not JSON."""
-    with explained(f"{path} holds no trials; remove it to begin anew"):
+    """Returns a trial's file. Raises `ValueError` for a file that is not JSON."""
+    with explained(f"{path} holds no trials; remove it to start again"):
         return json.loads(path.read_text())
 
 
 @lru_cache
 def fingerprint(model: Model, *settings: object) -> str:
-    """Tells models and settings apart: a change of a weight, or of a default, changes it."""
+    """Returns a hash of the model's weights and of the settings."""
     digest = hashlib.sha256(repr(settings).encode())
     for tensor in (*model.decoder.state_dict().values(), model.codes):
         digest.update(tensor.cpu().numpy().tobytes())

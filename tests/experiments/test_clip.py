@@ -20,7 +20,7 @@ from distrace.data.solid import Solid, load_solid, load_soup, turned
 from experiments.__main__ import main
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.clutter import NEAREST, boxes, sky
-from experiments.clips.patches import Patch, has_images, load_patches, painted, placed
+from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
 from experiments.clips.solid_texture import mottled, value_noise
 
 RED, GREEN, BLUE, WHITE = (220, 30, 30), (30, 200, 30), (30, 30, 220), (230, 230, 230)
@@ -107,7 +107,7 @@ def test_only_images_with_something_on_them_count(tmp_path: Path) -> None:
 
 def test_a_painted_patch_covers_the_same_surface_in_colours_that_vary(tmp_path: Path) -> None:
     (patch,) = placed(load_patches(stored(tmp_path, image=False)), 0.0)
-    fine = painted(patch, 3)
+    fine = mottled_patch(patch, 3)
     assert fine.area == pytest.approx(patch.area)
     assert np.linalg.norm(fine.corners - np.roll(fine.corners, 1, axis=1), axis=-1).max() <= 0.02 + 1e-9
     assert fine.colours.std((0, 1)).min() > 0.05

@@ -19,6 +19,7 @@ from distrace.mesh import MeshConfig
 from experiments.__main__ import main
 from experiments.commands import depth
 from experiments.datasets.splits import FOLDER
+from experiments.fields.analytic import NAMES
 from experiments.tables import completion, sparse_depth, spread, training_choices
 
 __all__ = ["model", "observation", "place", "run_distrace"]  # fixtures
@@ -86,7 +87,7 @@ def test_held_out_tells_a_model_all_distances(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     split, meshes = spheres_split
-    monkeypatch.setattr(completion, "TOLD", 4000)
+    monkeypatch.setattr(completion, "SAMPLES", 4000)
     monkeypatch.setattr(metrics, "POINTS", 2000)
     where = ("--model", model, "--split", split, "--meshes", meshes, "--out", tmp_path, "--resolution", 24)
     run("held-out", *where)
@@ -146,6 +147,16 @@ def test_spread_correlates_spread_and_error(
     assert -1 <= row["correlation"] <= 1
 
 
+def test_views_measures_analytic_fields_alone_where_no_model_is_named(
+    run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    run("views", "--views", 1, "--sizes", 16, 16, "--out", tmp_path)
+    assert [row["model"] for row in result(tmp_path, "rows")["rows"]] == list(NAMES)
+    said = capsys.readouterr().out
+    for line in result(tmp_path, "summary")["summary"]:
+        assert any(text.startswith(line["model"]) and text.endswith(line["bar"]) for text in said.splitlines()), line
+
+
 def test_splits_and_card_describe_what_a_model_was_trained_on(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
 ) -> None:
@@ -173,8 +184,8 @@ def test_choices_trains_small_networks(
         "sample", meshes, "--split", split, "--variants", 1, "--count", 1500, "--workers", 1, "--out", tmp_path / "s"
     )
     monkeypatch.setattr(training_choices, "SPECS", SPECS)
-    monkeypatch.setattr(completion, "TOLD", 500)
-    monkeypatch.setattr(completion, "TOLD_FIT", replace(completion.TOLD_FIT, iterations=4))
+    monkeypatch.setattr(completion, "SAMPLES", 500)
+    monkeypatch.setattr(completion, "SAMPLES_FIT", replace(completion.SAMPLES_FIT, iterations=4))
     monkeypatch.setattr(metrics, "POINTS", 500)
     where = ("--samples", tmp_path / "s", "--split", split, "--meshes", meshes, "--out", tmp_path / "out")
     run("choices", *where, "--others", tmp_path / "s", "--steps", 40, "--resolution", 24)

@@ -6,12 +6,12 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_distance
-from distrace.benchmarks.untrained import RADIUS, ball
 from distrace.checkpoints.model import load_model
 from distrace.fields.primitives import sphere
 from distrace.rays import meet_sphere
 from experiments.costs import growth
 from experiments.costs.pages import growth_page
+from experiments.fields.untrained import RADIUS, ball
 
 
 @pytest.fixture(autouse=True)

@@ -21,8 +21,8 @@ from experiments.tables.multiview import (
     ClipTrial,
     clip_done,
     disturbed,
-    left_over,
     multiview_rows,
+    remaining_motion,
     settings_of,
     surface_of,
 )
@@ -38,11 +38,11 @@ def test_a_disturbed_place_is_off_by_what_is_said() -> None:
         assert abs(math.expm1(abs(float(step[6])))) == pytest.approx(0.1, abs=1e-5)
 
 
-def test_what_is_left_over_is_how_a_surface_was_moved() -> None:
+def test_the_remaining_motion_is_how_a_surface_was_moved() -> None:
     box = trimesh.creation.box([1.0, 0.6, 0.3])
     moved = Similarity.identity().moved(torch.tensor([0.0, 0.05, 0.0, 0.02, 0.0, 0.0, 0.04]))
     surface = box.copy().apply_transform(moved.T_world_object.numpy())
-    degrees, *others = left_over(surface, box)
+    degrees, *others = remaining_motion(surface, box)
     assert degrees == pytest.approx(math.degrees(0.05), abs=0.3)  # 2.9, by points that are drawn
     assert others == pytest.approx([0.02, 0.04], abs=0.005)
 

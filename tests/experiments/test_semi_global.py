@@ -39,7 +39,7 @@ def test_rectified_views_see_the_origin_in_their_middle_columns_and_same_rows() 
 def test_images_without_anything_end_in_a_sentence() -> None:
     pytest.importorskip("cv2")
     blank = [Photograph(str(k), camera, torch.full((40, 40, 3), 0.5)) for k, camera in enumerate(ring(6, 40))]
-    with pytest.raises(ValueError, match="no point of 6 views was found by three pairs of them"):
+    with pytest.raises(ValueError, match="no three pairs of the 6 views agree on a point"):
         stereo_points(blank)
 
 

@@ -19,7 +19,7 @@ from distrace.rays import meet_sphere
 from experiments.tables import focal as focal_test
 from experiments.tables import sparse_depth
 from experiments.tables.depth_tables import AXES, depth_page, ratios, rows_of, wide
-from experiments.tables.focal import looks
+from experiments.tables.focal import renderings_of
 from experiments.tables.sparse_depth import (
     AZIMUTHS_ELEVATIONS,
     CONDITIONS,
@@ -119,7 +119,7 @@ def test_shapes_are_completed_and_looked_at_on_the_device(
     there = replace(here, out=tmp_path / "there", device=DEVICE)
     with pretended(monkeypatch):
         assert done(there, wanted).chamfer == pytest.approx(done(here, wanted).chamfer, rel=0.05)
-        overlaps = [[look.iou for look in looks(where, wanted)] for where in (there, here)]
+        overlaps = [[rendering.iou for rendering in renderings_of(where, wanted)] for where in (there, here)]
     assert overlaps[0] == pytest.approx(overlaps[1], abs=0.03)
 
 

@@ -1,1 +1,1 @@
-"""What `distrace bench` measures: strategies of tracing, random views, derivatives; and its pages."""
+"""Measurements of the tracer and of its gradients."""

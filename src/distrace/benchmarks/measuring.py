@@ -1,34 +1,31 @@
-"""Measuring ways to trace a view, against a reference that takes no chances."""
+"""Measures strategies of tracing on one view against a cautious reference."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
 from statistics import median
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.metrics import depth_errors, iou
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.render import Buffers
-from distrace.tracing.evaluator import Evaluator
 
-OUTLIER = 1e-3
-LONG = 60.0  # seconds; what takes longer is run once
-SMALLEST_STEP = 5e-5
+OUTLIER = 1e-3  # radii: a depth with a larger error is an outlier
+LONG = 60.0  # seconds; a longer run is not repeated
+SMALLEST_STEP = 5e-5  # radii
+LARGEST_STEP = 0.02  # radii
 
 
 @dataclass(frozen=True)
 class Row:
-    """One strategy: what it cost and how far it is off. `setup_queries` are among the `queries`.
+    """The cost and the errors of one strategy. `queries` include `setup_queries`.
 
-    Where only a sample of the rays was traced (`share` below 1), counts and times are extrapolated from it.
+    `share` is below 1 where only a sample of the rays was traced; counts and times are then extrapolated.
     """
 
     strategy: str
@@ -48,7 +45,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Case:
-    """What a row is measured on: a way to render some rays, and the depth that they should show."""
+    """A strategy, a function that renders by it, and the true depth."""
 
     strategy: str
     render: Callable[[], Buffers]
@@ -56,37 +53,8 @@ class Case:
     share: float = 1.0  # of all rays that enter the sphere
 
 
-class Operations(TorchDispatchMode):
-    """Counts what PyTorch is asked to do."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.count = 0
-
-    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
-        self.count += 1
-        return func(*args, **(kwargs or {}))
-
-
-@contextmanager
-def recorded() -> Iterator[list[partial[Tensor]]]:
-    """What the tracer evaluates meanwhile, to be evaluated once more."""
-    calls: list[partial[Tensor]] = []
-    at = Evaluator.at
-
-    def watched(self: Evaluator, points: Tensor, shape: Tensor | None, *, rough: bool = False) -> Tensor:
-        calls.append(partial(at, self, points, shape, rough=rough))
-        return calls[-1]()
-
-    Evaluator.at = watched
-    try:
-        yield calls
-    finally:
-        Evaluator.at = at
-
-
 def poster_view(size: int = 512) -> Camera:
-    """The view that all tables are measured on: 122,172 rays enter the unit sphere at 512 × 512.
+    """Returns the view of all tables; at 512 × 512, 122,172 of its rays enter the unit sphere.
 
     The published table has 122,166: some rays graze the sphere within the rounding of float32.
     """
@@ -99,94 +67,107 @@ def reference_distance(
 ) -> Float[Tensor, "*batch"]:
     """Returns the distance of the first surface on each ray, `inf` where there is none.
 
-    A cautious march (half the value, at most 0.02) until the sign changes, then bisection to 1e-6. Steps are never
-    shorter than the `smallest`, so that a ray on which f only comes close to zero ends. A ray that starts in the solid
-    sees nothing, as for every strategy (`Outcome.INSIDE`).
+    The march steps by half the value, at most LARGEST_STEP, until the sign changes. Bisection then finds the root to
+    1e-6. Steps are never below `smallest`, so that a march along a surface ends. A ray that starts in the solid sees
+    nothing, as for every strategy (`Outcome.INSIDE`).
     """
-    rays, near, far = rays.flat(), bounds.near.reshape(-1), bounds.far.reshape(-1)
-    low, high = near.clone(), torch.full_like(near, torch.inf)
+    rays = rays.flat()
+    near = bounds.near.reshape(-1)
+    far = bounds.far.reshape(-1)
+    position = near.clone()
+    inside = torch.full_like(near, torch.inf)
     outside = torch.full_like(near, -torch.inf)  # the last sample before the sign changes
     active = bounds.meets.reshape(-1).nonzero()[:, 0]
     while len(active):
-        value = sdf(rays[active].at(low[active]))
+        value = sdf(rays[active].at(position[active]))
         crossed = value < 0
-        high[active[crossed]] = low[active[crossed]]
-        active, value = active[~crossed], value[~crossed]
-        last = low[active]
+        inside[active[crossed]] = position[active[crossed]]
+        active = active[~crossed]
+        last = position[active]
         outside[active] = last
-        ahead = last + (0.5 * value).clamp(smallest, 0.02)
-        low[active] = ahead.maximum(last.nextafter(far[active]))  # where a step is less than a number can tell
-        active = active[low[active] < far[active]]
-    return _bisected(sdf, rays, outside, high).reshape(bounds.near.shape)
+        ahead = last + (0.5 * value[~crossed]).clamp(smallest, LARGEST_STEP)
+        position[active] = ahead.maximum(last.nextafter(far[active]))  # a step may vanish in rounding
+        active = active[position[active] < far[active]]
+    return _bisected(sdf, rays, outside, inside).reshape(bounds.near.shape)
 
 
 def _bisected(sdf: SDF, rays: Rays, outside: Float[Tensor, "n"], inside: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
-    """Returns the zero between two samples at most 0.02 apart; `inf` where one of them is not finite."""
-    found = (torch.isfinite(inside) & torch.isfinite(outside)).nonzero()[:, 0]
-    low, high = outside[found], inside[found]
+    """Returns the root between two samples at most LARGEST_STEP apart; `inf` where one of them is not finite."""
+    bracketed = (torch.isfinite(inside) & torch.isfinite(outside)).nonzero()[:, 0]
+    low = outside[bracketed]
+    high = inside[bracketed]
     for _ in range(15):  # 0.02 / 2^15 < 1e-6
         middle = (low + high) / 2
-        solid = sdf(rays[found].at(middle)) < 0
-        low, high = torch.where(solid, low, middle), torch.where(solid, middle, high)
-    return torch.full_like(inside, torch.inf).index_put((found,), (low + high) / 2)
+        solid = sdf(rays[bracketed].at(middle)) < 0
+        low = torch.where(solid, low, middle)
+        high = torch.where(solid, middle, high)
+    return torch.full_like(inside, torch.inf).index_put((bracketed,), (low + high) / 2)
 
 
 def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tensor, "height width"]:
-    """By `reference_distance`, whose smallest step is at most a twentieth of a pixel at the sphere's middle."""
+    """Returns the depth by `reference_distance`, with steps down to a twentieth of a pixel at the sphere's middle."""
     rays = camera.rays()
-    away = max(float(camera.T_world_camera[:3, 3].norm()), 0.1 * radius)
-    finest = float(camera.pixel_angle().amin()) * away / 20
+    distance = max(float(camera.T_world_camera[:3, 3].norm()), 0.1 * radius)
+    finest = float(camera.pixel_angle().amin()) * distance / 20
     return camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius), min(SMALLEST_STEP, finest)))
 
 
-def measure(cases: Iterable[Case], repeats: int, said: Callable[[str], object] = str) -> list[tuple[Row, Buffers]]:
-    """Runs all cases in turn; a row's time is its median."""
+def measure(
+    cases: Iterable[Case], repeats: int, report: Callable[[str], object] = lambda text: None
+) -> list[tuple[Row, Buffers]]:
+    """Runs all cases in turn; a row's time is its median. `report` gets a line after each run.
+
+    Raises `ValueError` for a view that shows nothing.
+    """
     cases = list(cases)
-    results = in_turn({case.strategy: case.render for case in cases}, repeats, said)
+    results = in_turn({case.strategy: case.render for case in cases}, repeats, report)
     return [(_row(case, *results[case.strategy]), results[case.strategy][0]) for case in cases]
 
 
 def in_turn(
-    runs: Mapping[str, Callable[[], Buffers]], repeats: int, said: Callable[[str], object] = str
+    runs: Mapping[str, Callable[[], Buffers]], repeats: int, report: Callable[[str], object] = lambda text: None
 ) -> dict[str, tuple[Buffers, float, int]]:
-    """Each once to warm up and then `repeats` times, in turn: the last result, the median time, and of how many runs.
+    """Returns the last result of each run, its median time in seconds, and the number of timed runs.
 
-    What takes over a minute runs once. `said` is told what was done.
+    Each runs once to warm up and then `repeats` times, in turn. A run of more than LONG seconds is not repeated.
     """
-    results, seconds = {}, {name: [] for name in runs}
+    results: dict[str, Buffers] = {}
+    seconds: dict[str, list[float]] = {name: [] for name in runs}
     for turn in range(repeats + 1 if repeats > 1 else 1):
         for name, run in runs.items():
             if turn and seconds[name][0] > LONG:
                 continue
-            results[name], taken = _timed(run)
-            seconds[name].append(taken)
-            said(f"{name}: {taken:.1f} s")
-    timed = {name: times[1:] or times for name, times in seconds.items()}
-    return {name: (results[name], median(times), len(times)) for name, times in timed.items()}
+            results[name], duration = _timed(run)
+            seconds[name].append(duration)
+            report(f"{name}: {duration:.1f} s")
+    timed = {name: durations[1:] or durations for name, durations in seconds.items()}
+    return {name: (results[name], median(durations), len(durations)) for name, durations in timed.items()}
 
 
 @torch.no_grad()
 def _timed(run: Callable[[], Buffers]) -> tuple[Buffers, float]:
-    began = time.perf_counter()
+    start = time.perf_counter()
     buffers = run()
     if buffers.trace.distance.is_cuda:
         torch.cuda.synchronize()
-    return buffers, time.perf_counter() - began
+    return buffers, time.perf_counter() - start
 
 
 def _row(case: Case, buffers: Buffers, seconds: float, runs: int) -> Row:
-    trace, errors = buffers.trace, depth_errors(buffers.depth, case.truth)
+    trace = buffers.trace
+    errors = depth_errors(buffers.depth, case.truth)
     if not len(errors):
         raise ValueError("the view shows nothing of this shape; there is nothing to measure")
+    visible = torch.isfinite(case.truth)
     return Row(
         strategy=case.strategy,
         queries=round(trace.total_evaluations / case.share),
         setup_queries=trace.setup_evaluations,
-        per_pixel=trace.total_evaluations / max(int(torch.isfinite(case.truth).sum()), 1),
+        per_pixel=trace.total_evaluations / max(int(visible.sum()), 1),
         seconds=seconds / case.share,
         runs=runs,
         hits=round(int(buffers.mask.sum()) / case.share),
-        iou=iou(buffers.mask, torch.isfinite(case.truth)),
+        iou=iou(buffers.mask, visible),
         depth_mean=float(errors.mean()),
         depth_p99=float(errors.quantile(0.99)) if len(errors) < 1 << 24 else float("nan"),
         depth_max=float(errors.max()),

@@ -1,6 +1,6 @@
-"""Random codes and cameras: what a rendering is tried on.
+"""Random codes and cameras to measure a tracer on.
 
-The object is neither always whole in the image nor always tiny: distance and focal length are drawn apart.
+Distance and focal length are drawn independently, so the object is sometimes cut off and sometimes tiny.
 """
 
 from collections.abc import Iterator
@@ -19,12 +19,13 @@ SENSOR_MM = 32.0
 DISTANCES = (1.6, 12.0)  # of the eye from the origin, in radii
 FOCALS_MM = (18.0, 200.0)
 ELEVATIONS = (-30.0, 70.0)  # degrees
-TRIED, NEWTON = 256, 4  # points that a camera may aim at, and steps from the best of them to the surface
+CANDIDATES = 256  # points near which a camera may aim
+NEWTON_STEPS = 4  # from the best of them to the surface
 
 
 @dataclass(frozen=True)
 class Shot:
-    """A camera in the numbers that it was drawn by: angles in degrees, lengths in radii of the unit sphere."""
+    """A camera in the numbers that are drawn: angles in degrees, lengths in radii of the unit sphere."""
 
     azimuth: float
     elevation: float
@@ -43,7 +44,7 @@ class Shot:
         return Camera.orbit(self.azimuth, self.elevation, self.distance).T_world_camera[:3, 3]
 
     def pixel(self, point: Float[Tensor, "3"]) -> float:
-        """The width in the world of what one pixel sees at a point in the middle of the image."""
+        """Returns the width of one pixel at a point in the middle of the image, in radii."""
         return float((self.eye() - point).norm()) * SENSOR_MM / (self.focal_mm * self.size)
 
 
@@ -58,13 +59,13 @@ class Mixture:
 
 @dataclass(frozen=True)
 class View:
-    """What is rendered: a field, by a camera; and a bound on the field's slope, by which the reference divides it."""
+    """A field and a camera. The reference divides the field by its Lipschitz constant."""
 
     model: str
     code: int | Mixture | None  # None for an analytic field
     sdf: SDF
     shot: Shot
-    steepest: float = 1.0
+    lipschitz: float = 1.0
     device: torch.device = torch.device("cpu")
 
     def camera(self) -> Camera:
@@ -72,7 +73,7 @@ class View:
 
 
 def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> Iterator[View]:
-    """Draws codes and cameras; every third code lies between two training codes. The first views never depend on count.
+    """Draws codes and cameras. Every third code lies between two training codes; a larger count appends views.
 
     Raises `ValueError` for sizes that no image has.
     """
@@ -85,10 +86,10 @@ def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> 
 
 
 def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
-    """Draws a camera that looks at the origin. Distance and focal length are drawn apart, evenly in their logarithms.
+    """Draws a camera that looks at the origin; distance and focal length are uniform in their logarithms.
 
-    Small images are more likely, by the cube of their size, so that each octave of sizes costs about the same.
-    Raises `ValueError` for sizes that no image has.
+    The density of sizes falls with their cube, so that each octave of sizes costs about the same. Raises `ValueError`
+    for sizes that no image has.
     """
     low, high = sizes
     if not 1 <= low <= high:
@@ -105,10 +106,10 @@ def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
 
 @torch.no_grad()
 def aimed(shot: Shot, sdf: SDF, random: np.random.Generator, device: torch.device = torch.device("cpu")) -> Shot:
-    """The shot with its target moved to a random point near the surface, so that also a long lens sees some of it."""
-    points = torch.from_numpy(random.uniform(-0.6, 0.6, (TRIED, 3))).float().to(device)
+    """Returns the shot with its target at a random point near the surface, so that a long lens sees some of it."""
+    points = torch.from_numpy(random.uniform(-0.6, 0.6, (CANDIDATES, 3))).float().to(device)
     point = points[sdf(points).abs().argmin()]
-    for _ in range(NEWTON):
+    for _ in range(NEWTON_STEPS):
         value, gradient = value_and_gradient(sdf, point[None])
         step = (value[:, None] * gradient / gradient.square().sum().clamp_min(1e-6))[0]
         point = point - step * (0.2 / step.norm().clamp_min(1e-9)).clamp_max(1.0)

@@ -1,1 +1,1 @@
-"""Derivatives of images held against finite differences, and against those of DIST."""
+"""Checks derivatives of images against finite differences, and implements DIST's gradient for comparison."""

@@ -1,4 +1,4 @@
-"""DIST's own gradient of a distance, for comparison: biased, where `surface.attach` is exact."""
+"""DIST's own gradient of a distance, for comparison: it is biased, while `surface.attach` is exact."""
 
 from dataclasses import dataclass
 
@@ -13,22 +13,23 @@ from distrace.tracing.sphere_tracing import AGGRESSIVE, TraceConfig
 
 @dataclass(frozen=True)
 class Queries:
-    """Where a march ended, and where it asked last."""
+    """The hits of a march, and the distances of its last queries."""
 
     distance: Float[Tensor, "*batch"]  # `inf` without a hit
-    last: Float[Tensor, "queries *batch"]  # the latest last; NaN where a ray had fewer
+    last: Float[Tensor, "queries *batch"]  # in the order of the march; NaN where a ray had fewer
     config: TraceConfig
 
 
 @torch.no_grad()
 def march(sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = AGGRESSIVE, queries: int = 5) -> Queries:
-    """DIST's plain march, t ← t + α · f, that keeps its last queries (the original's demo 3, its default 5).
+    """Runs DIST's march t ← t + α · f and keeps the last `queries` distances (DIST's default is 5).
 
     Raises `ValueError` for fewer than one query.
     """
     if queries < 1:
-        raise ValueError(f"the last {queries} queries were asked for; DIST's gradient needs at least 1")
-    flat, far = rays.detach().flat(), bounds.far.reshape(-1)
+        raise ValueError(f"the last {queries} queries were given; DIST's gradient needs at least 1")
+    flat = rays.detach().flat()
+    far = bounds.far.reshape(-1)
     t = bounds.near.reshape(-1).clone()
     distance = torch.full_like(t, torch.inf)
     last = torch.full_like(t, torch.nan).repeat(queries, 1)
@@ -44,18 +45,17 @@ def march(sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = AGGRESSIVE
 
 
 def attach_dist(sdf: SDF, rays: Rays, marched: Queries, queries: int | None = None) -> Float[Tensor, "*batch"]:
-    """The distances of a march, with the derivative of d = α Σ f(p⁽ⁿ⁾) over the last queries at fixed distances.
+    """Returns the distances of a march, with the derivative of d = α Σ f(p⁽ⁿ⁾) over the last queries.
 
-    It drops how each p⁽ⁿ⁾ depends on the queries before (Liu et al., CVPR 2020, section 3.3), and counts the surface's
-    motion once per query: on a sphere it is wrong by a factor of α · queries · cos θ, at an angle θ to the normal.
+    The points p⁽ⁿ⁾ are held fixed (Liu et al., CVPR 2020, section 3.3), so the surface's motion counts once per
+    query. On a sphere the derivative is off by the factor α · queries · cos θ, where θ is the angle to the normal.
     """
     hit = marched.distance.isfinite()
     last = marched.last[-queries:] if queries else marched.last
-    asked = last.isfinite() & hit
-    fixed = Rays(rays.origins.expand(*last.shape, 3)[asked], rays.directions.expand(*last.shape, 3)[asked])
-    steps = _step(sdf(fixed.at(last[asked])), marched.config)
-    moved = torch.zeros_like(last).masked_scatter(asked, steps - steps.detach()).sum(0)
-    return marched.distance + moved
+    queried = last.isfinite() & hit
+    fixed = Rays(rays.origins.expand(*last.shape, 3)[queried], rays.directions.expand(*last.shape, 3)[queried])
+    steps = _step(sdf(fixed.at(last[queried])), marched.config)
+    return marched.distance + torch.zeros_like(last).masked_scatter(queried, steps - steps.detach()).sum(0)
 
 
 def _step(value: Tensor, config: TraceConfig) -> Tensor:

@@ -1,6 +1,6 @@
-"""Every derivative of an image against finite differences, on a field and a camera of the user's own."""
+"""Checks every derivative of an image against finite differences, on any field and camera."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
@@ -15,31 +15,31 @@ from distrace.checking.moves import Change, Move, Tally, all_moves, in_double, o
 from distrace.checking.retrace import DOUBLE, SINGLE, Precision, Retraced
 from distrace.fields.base import SDF
 
-STRAY = 0.01  # of what is compared: so much may be off, on kinks of ReLU networks that one-sided differences miss
-SMALL = 0.1  # of the median derivative: smaller ones are measured against that
-ROUGHLY = 0.2  # the median error up to which a footprint normal's derivative agrees: bundled models' are 0.02 – 0.15
+STRAY = 0.01  # share of the pixels that may be off: one-sided differences miss some kinks of ReLU networks
+SMALL = 0.1  # × the median derivative: the scale of relative errors is never below it
+ROUGHLY = 0.2  # median error up to which footprint normals agree: those of bundled models have 0.02 – 0.15
 
 Verdict = Literal["agrees", "disagrees", "zero"]
 
 
 @dataclass(frozen=True)
 class GradientRow:
-    """One quantity by one parameter: errors are relative, and over all components of the parameter."""
+    """The errors of one quantity's derivatives by one parameter: relative, over all components of the parameter."""
 
     quantity: str
     parameter: str
     median: float
     worst: float
-    x: int  # the worst pixel
+    x: int  # of the worst pixel
     y: int
-    along: str  # and the component of the parameter
+    along: str  # the component of the parameter at which it is worst
     derivative: tuple[float, ...]
     difference: tuple[float, ...]
     pixels: int  # compared, once for each component
     off: int  # of these, by more than the tolerance
-    left_out: int  # a kink, or no surface or minimum on both sides
-    verdict: Verdict  # "zero": both are zero wherever they were compared, so that nothing was tested
-    step: float = 0.0  # by which hits move to either side for the differences; 0: as little as numbers allow
+    left_out: int  # kinks, and pixels without surface or minimum on both sides
+    verdict: Verdict  # "zero": derivatives and differences are all zero, so the row tests nothing
+    step: float = 0.0  # by which differences move the median hit, in radii; 0: `Precision.step` of the parameter
 
     @property
     def agrees(self) -> bool:
@@ -48,7 +48,7 @@ class GradientRow:
 
 @dataclass(frozen=True)
 class GradientCheck:
-    """All rows, the precision they were measured in, and how often the field was asked."""
+    """All rows, the precision of the differences, and the number of evaluations of the field."""
 
     rows: tuple[GradientRow, ...]
     precision: Precision
@@ -56,13 +56,13 @@ class GradientCheck:
 
     @property
     def agrees(self) -> bool:
-        """Whether no row disagrees; a row of zeros does not."""
+        """Whether no row disagrees; a row of zeros counts as neither."""
         return not any(row.verdict == "disagrees" for row in self.rows)
 
     def verdicts(self) -> dict[Verdict, int]:
-        """How many rows have each verdict."""
-        every: tuple[Verdict, ...] = get_args(Verdict)
-        return {verdict: sum(row.verdict == verdict for row in self.rows) for verdict in every}
+        """Returns how many rows have each verdict."""
+        names: tuple[Verdict, ...] = get_args(Verdict)
+        return {verdict: sum(row.verdict == verdict for row in self.rows) for verdict in names}
 
 
 @dataclass(frozen=True)
@@ -83,102 +83,110 @@ def check_gradients(
     radius: float = 1.0,
     size: int = 48,
 ) -> GradientCheck:
-    """Compares derivatives of distance, depth, hit points, normals, clearance and footprint normals with differences.
+    """Compares the derivatives of distance, depth, hit points, normals and clearance with central differences.
 
-    Along the camera's pose and intrinsics, the place of the shape, and the `parameters`: each turns a number h (a
-    tensor without axes) into the field moved by h; by default the weights of a network, and the code of a decoder's
-    shape. On an image of at most `size` pixels a side, in float64 where the field follows. A pixel is left out, and
-    counted, where one-sided differences disagree (a kink: ReLU networks are full of them), where its surface is gone
-    on one side, and where the least value on its ray lies on the bounds. Of the others at most STRAY may be off. A row
-    whose derivatives and differences are all zero gets the verdict "zero", not "agrees". No derivative of a hit sees an
-    outline move, and neither does this.
+    It moves the camera's pose and intrinsics, the placement of the shape, and the `parameters`. Each parameter is a
+    function from a number h (a tensor without axes) to the field changed by h. By default these are the weights of a
+    network, or code and weights of a decoder's shape. The image has at most `size` pixels a side, in float64 where the
+    field accepts it.
 
-    Footprint normals are compared at a few hits, over steps that move these by a part of the footprint (see
-    `Footprints`), kinks and all; the row agrees if the median error is at most ROUGHLY.
+    Three kinds of pixels are left out and counted: kinks, where one-sided differences disagree; pixels whose surface
+    is lost on one side; rays whose minimum lies on the bounds. A row agrees if at most STRAY of the other pixels are
+    off. No derivative of a hit knows that an outline moves, so outlines are not part of this check.
 
-    Raises `ValueError` where the camera sees nothing of the shape, or for a size below 1.
+    Footprint normals are compared at a few hits, kinks included, over steps of a part of the footprint (see
+    `Footprints`). They agree up to a median error of ROUGHLY.
+
+    Raises `ValueError` where the camera sees nothing of the shape, and for a size below 1.
+
+    >>> import distrace as dt
+    >>> camera = dt.Camera.orbit(30, 20, 4.97, height=16, width=16)
+    >>> sphere = dt.primitives.sphere
+    >>> dt.check_gradients(sphere(0.5), camera, parameters={"radius": lambda h: sphere(0.5 + h)}).agrees
+    True
     """
     if size < 1:
-        raise ValueError(f"an image of {size} pixels a side was asked for; it must be at least 1")
-    field, changes = in_double(field), own_changes(in_double(field)) if parameters is None else parameters
+        raise ValueError(f"an image of {size} pixels a side was given; at least 1 is needed")
+    field = in_double(field)
+    changes = own_changes(field) if parameters is None else parameters
     like = camera.intrinsics.double()
-    moved = [change(like.new_zeros(())) for change in changes.values()]
-    precision = DOUBLE if all(_follows(sdf, like) for sdf in (field, *moved)) else SINGLE
+    changed = [change(like.new_zeros(())) for change in changes.values()]
+    precision = DOUBLE if all(_accepts_double(sdf, like) for sdf in (field, *changed)) else SINGLE
     camera = camera.detach().resized(min(size / max(camera.height, camera.width), 1.0))
-    matrices = camera.intrinsics.to(precision.dtype), camera.T_world_camera.to(precision.dtype)
-    camera = replace(camera, intrinsics=matrices[0], T_world_camera=matrices[1])
+    intrinsics = camera.intrinsics.to(precision.dtype)
+    camera = replace(camera, intrinsics=intrinsics, T_world_camera=camera.T_world_camera.to(precision.dtype))
     tally = Tally()
     view = Retraced.of(tally.field(field), camera, radius, precision)
-    here = view.traced_anew(tally.field(field), camera)
+    values = view.retraced(tally.field(field), camera)
     footprints = Footprints.of(view, tally.field(field), camera)
     rows: list[GradientRow] = []
     for parameter, components in all_moves(field, camera, changes).items():
         moves = {along: tally.move(move) for along, move in components.items()}
-        compared = [_compared(view, here, along, move) for along, move in moves.items()]
-        rows += [_row(view, quantity, parameter, [by[quantity] for by in compared]) for quantity in compared[0]]
-        rows.append(_footprint_row(view, footprints, parameter, moves, parameter in changes))
+        compared = [_compare_view(view, values, along, move) for along, move in moves.items()]
+        for quantity in compared[0]:
+            by_component = [by_quantity[quantity] for by_quantity in compared]
+            rows.append(_row(quantity, parameter, by_component, view.pixels(quantity), precision))
+        rows.append(_footprint_row(footprints, parameter, moves, footprints.step(of_field=parameter in changes)))
     return GradientCheck(tuple(rows), precision, tally.evaluations)
 
 
-def _follows(sdf: SDF, like: Tensor) -> bool:
-    """Whether a field takes float64 and gives it back."""
+def _accepts_double(sdf: SDF, like: Tensor) -> bool:
+    """Whether a field takes float64 and returns it."""
     try:
         return sdf(like.new_zeros(1, 3)).dtype == torch.float64
     except RuntimeError:
         return False
 
 
-def _compared(view: Retraced, here: Images, along: str, move: Move) -> dict[str, Compared]:
-    """Every quantity that the view has pixels of."""
-    slopes = derivatives(lambda h: view.attached(*move(h)), here["distance"])
-    central, bends = differences(lambda h: view.traced_anew(*move(h)), here, view.precision.step, here["distance"])
+def _compare_view(view: Retraced, values: Images, along: str, move: Move) -> dict[str, Compared]:
+    """Returns the comparison of every quantity that has pixels."""
+    like = values["distance"]
+    slopes = derivatives(lambda h: view.attached(*move(h)), like)
+    central, kinks = differences(lambda h: view.retraced(*move(h)), values, view.precision.step, like)
     return {
-        name: compare(along, slopes[name], central[name], bends[name], view.precision)
+        name: compare(along, slopes[name], central[name], kinks[name], view.precision)
         for name in central
         if len(central[name])
     }
 
 
-def compare(along: str, derivative: Tensor, difference: Tensor, bend: Tensor | None, precision: Precision) -> Compared:
-    """Each pixel's relative error; by `bend` the one-sided differences disagree, and None leaves no kinks out."""
-    derivative, difference = (image.reshape(len(image), -1) for image in (derivative, difference))
+def compare(along: str, derivative: Tensor, difference: Tensor, kink: Tensor | None, precision: Precision) -> Compared:
+    """Returns each pixel's relative error. `kink` is how far one-sided differences disagree; None keeps all pixels."""
+    derivative = derivative.reshape(len(derivative), -1)
+    difference = difference.reshape(len(difference), -1)
     size = difference.norm(dim=-1)
     scale = size.clamp_min(max(precision.least, SMALL * float(size.nanmedian().nan_to_num())))
-    bent = torch.zeros_like(size) if bend is None else bend.reshape(len(bend), -1).norm(dim=-1)
-    left_out = size.isnan() | ~(bent <= precision.tolerance * scale)
+    disagreement = torch.zeros_like(size) if kink is None else kink.reshape(len(kink), -1).norm(dim=-1)
+    left_out = size.isnan() | ~(disagreement <= precision.tolerance * scale)
     error = ((derivative - difference).norm(dim=-1) / scale).nan_to_num(torch.inf, posinf=torch.inf)
     return Compared(along, derivative, difference, error.masked_fill(left_out, torch.nan))
 
 
-def _footprint_row(
-    view: Retraced, footprints: Footprints, parameter: str, moves: Mapping[str, Move], of_field: bool
-) -> GradientRow:
-    """The row of footprint normals by a parameter, which is of the field itself or of what sees it."""
-    step = footprints.step(of_field)
-    found = {along: footprints.both(move, step) for along, move in moves.items()}
-    compared = [compare(along, *both, None, view.precision) for along, both in found.items()]
-    row = _row(view, "footprint normal", parameter, compared, footprints.pixels(), ROUGHLY)
-    if row.verdict == "zero":
-        return replace(row, step=step)
-    return replace(row, step=step, verdict="agrees" if row.median <= ROUGHLY else "disagrees")
+def _footprint_row(footprints: Footprints, parameter: str, moves: Mapping[str, Move], step: float) -> GradientRow:
+    precision = footprints.view.precision
+    compared = [compare(along, *footprints.slopes(move, step), None, precision) for along, move in moves.items()]
+    pixels = footprints.pixels()
+    row = replace(_row("footprint normal", parameter, compared, pixels, precision, ROUGHLY), step=step)
+    return row if row.verdict == "zero" else replace(row, verdict="agrees" if row.median <= ROUGHLY else "disagrees")
 
 
 def _row(
-    view: Retraced,
     quantity: str,
     parameter: str,
-    compared: list[Compared],
-    pixels: Tensor | None = None,
+    compared: Sequence[Compared],
+    pixels: Tensor,
+    precision: Precision,
     tolerance: float | None = None,
 ) -> GradientRow:
-    """The pixels' (x, y) and the tolerance are the view's where they are not given."""
-    tolerance = view.precision.tolerance if tolerance is None else tolerance
-    errors = torch.cat([by.error for by in compared])
-    kept, off = ~errors.isnan(), errors > tolerance
+    """Returns the row of a parameter's components. `pixels` are (x, y); the tolerance is the precision's by default."""
+    errors = torch.cat([component.error for component in compared])
+    valid = ~errors.isnan()
+    off = errors > (precision.tolerance if tolerance is None else tolerance)
     at = int(errors.nan_to_num(-1.0, posinf=torch.inf).argmax())
-    worst, pixel = compared[at // len(compared[0].error)], at % len(compared[0].error)
-    x, y = (view.pixels(quantity) if pixels is None else pixels)[pixel].tolist()
-    agrees = bool(errors[at].isfinite() and off.sum() <= STRAY * kept.sum())
+    component, pixel = divmod(at, len(pixels))
+    worst = compared[component]
+    x, y = pixels[pixel].tolist()
+    agrees = bool(errors[at].isfinite() and off.sum() <= STRAY * valid.sum())
     return GradientRow(
         quantity,
         parameter,
@@ -189,16 +197,16 @@ def _row(
         along=worst.along,
         derivative=tuple(worst.derivative[pixel].tolist()),
         difference=tuple(worst.difference[pixel].tolist()),
-        pixels=int(kept.sum()),
+        pixels=int(valid.sum()),
         off=int(off.sum()),
-        left_out=int((~kept).sum()),
-        verdict="disagrees" if not agrees else "zero" if _zero(compared, view.precision) else "agrees",
+        left_out=int((~valid).sum()),
+        verdict="disagrees" if not agrees else "zero" if _all_zero(compared, precision) else "agrees",
     )
 
 
-def _zero(compared: list[Compared], precision: Precision) -> bool:
-    """Whether derivatives and differences are zero, as far as can be told, at all but STRAY of what is compared."""
-    sizes = [torch.cat([by.derivative, by.difference], dim=-1).abs().amax(-1) for by in compared]
-    kept = ~torch.cat([by.error for by in compared]).isnan()
-    some = torch.cat(sizes)[kept] > precision.tolerance * precision.least
-    return bool(some.sum() <= STRAY * len(some))
+def _all_zero(compared: Sequence[Compared], precision: Precision) -> bool:
+    """Whether derivatives and differences are zero within the precision at all but STRAY of the compared pixels."""
+    sizes = torch.cat([torch.cat([each.derivative, each.difference], dim=-1).abs().amax(-1) for each in compared])
+    valid = ~torch.cat([each.error for each in compared]).isnan()
+    nonzero = sizes[valid] > precision.tolerance * precision.least
+    return bool(nonzero.sum() <= STRAY * len(nonzero))

@@ -1,7 +1,7 @@
-"""Ways to move a field and its camera by one number h: what derivatives are checked along.
+"""Ways to change a field or its camera by one number h, along which derivatives are checked.
 
-All are without units: h = 1 turns by a radian, shifts by the unit sphere's radius, doubles a focal length, shifts the
-principal point by the image's width, and changes a code or weights by as much as they are.
+h has no unit. h = 1 turns by a radian, shifts by the radius of the unit sphere, or doubles a focal length. It shifts
+the principal point by the image's width, and changes a code or weights by their own norm.
 """
 
 from collections.abc import Callable, Mapping
@@ -24,21 +24,22 @@ Moves = Mapping[str, Mapping[str, Move]]  # by parameter, and by its components
 
 
 class Tally:
-    """Counts how often fields are asked, all together."""
+    """Counts the evaluations of several fields together."""
 
     def __init__(self) -> None:
-        self.asked: list[Counted] = []
+        self.fields: list[Counted] = []
 
     @property
     def evaluations(self) -> int:
-        return sum(counted.evaluations for counted in self.asked)
+        return sum(counted.evaluations for counted in self.fields)
 
     def field(self, sdf: SDF) -> Counted:
-        self.asked.append(Counted(sdf))
-        return self.asked[-1]
+        """Returns the field, counted."""
+        self.fields.append(Counted(sdf))
+        return self.fields[-1]
 
     def move(self, move: Move) -> Move:
-        """The same, and its fields are counted."""
+        """Returns the move with its fields counted."""
 
         def counted(h: Tensor) -> tuple[SDF, Camera]:
             sdf, camera = move(h)
@@ -48,54 +49,56 @@ class Tally:
 
 
 def all_moves(sdf: SDF, camera: Camera, changes: Mapping[str, Change]) -> Moves:
-    """Of the camera, of the place of the shape, and of the field's own parameters."""
+    """Returns the moves of the camera, of the shape's placement, and of the field's own parameters."""
     of_field = {name: {"": lambda h, change=change: (change(h), camera)} for name, change in changes.items()}
     return {**camera_moves(sdf, camera), **placements(sdf, camera), **of_field}
 
 
 def camera_moves(sdf: SDF, camera: Camera) -> Moves:
-    """The pose in the camera's own axes, the focal length, and the principal point."""
+    """Returns the moves of the pose along the camera's own axes, of the focal length, and of the principal point."""
     like = camera.intrinsics
-    turns, shifts = _turns(like), _shifts(like)
-    longer = torch.diag(torch.stack([like[0, 0], like[1, 1], like.new_zeros(())]))
-    aside = {axis: camera.width * torch.outer(_unit(like, 3, k), _unit(like, 3, 2)) for k, axis in enumerate("xy")}
+    pose_moves = {
+        name: {axis: partial(_move_pose, sdf, camera, generator) for axis, generator in generators.items()}
+        for name, generators in (("camera rotation", _rotations(like)), ("camera translation", _translations(like)))
+    }
+    zoom = torch.diag(torch.stack([like[0, 0], like[1, 1], like.new_zeros(())]))
+    shifts = {axis: camera.width * torch.outer(_unit(like, 3, k), _unit(like, 3, 2)) for k, axis in enumerate("xy")}
     return {
-        "camera rotation": {axis: partial(_posed, sdf, camera, turn) for axis, turn in turns.items()},
-        "camera translation": {axis: partial(_posed, sdf, camera, shift) for axis, shift in shifts.items()},
-        "focal length": {"": partial(_seen, sdf, camera, longer)},
-        "principal point": {axis: partial(_seen, sdf, camera, change) for axis, change in aside.items()},
+        **pose_moves,
+        "focal length": {"": partial(_change_intrinsics, sdf, camera, zoom)},
+        "principal point": {axis: partial(_change_intrinsics, sdf, camera, shift) for axis, shift in shifts.items()},
     }
 
 
 def placements(sdf: SDF, camera: Camera) -> Moves:
-    """The similarity that places the shape in the world."""
+    """Returns the moves of the similarity that places the shape in the world."""
     like = camera.intrinsics
-    generators = {f"rotation {axis}": turn for axis, turn in _turns(like).items()}
-    generators |= {f"translation {axis}": shift for axis, shift in _shifts(like).items()}
+    generators = {f"rotation {axis}": generator for axis, generator in _rotations(like).items()}
+    generators |= {f"translation {axis}": generator for axis, generator in _translations(like).items()}
     generators |= {"scale": torch.diag(like.new_tensor([1.0, 1, 1, 0]))}
-    return {"placement": {name: partial(_put, sdf, camera, generator) for name, generator in generators.items()}}
+    return {"placement": {name: partial(_move_shape, sdf, camera, generator) for name, generator in generators.items()}}
 
 
 def decoder_changes(decoder: Decoder, code: Float[Tensor, "length"]) -> dict[str, Change]:
-    """A decoder's field as its code moves, and as all its weights do; each in a random direction."""
-    along = _direction(code.detach())
-    return {"code": lambda h: decoder.field(code + h * along), "weights": weight_change(decoder, code.detach())}
+    """Returns a decoder's field as its code moves, and as all its weights move, each in a random direction."""
+    direction = _direction(code.detach())
+    return {"code": lambda h: decoder.field(code + h * direction), "weights": weight_change(decoder, code.detach())}
 
 
 def weight_change(network: nn.Module, *inputs: Tensor) -> Change:
-    """A network's field as all its weights move in a random direction; `inputs` follow the points in its call."""
+    """Returns a network's field as all its weights move in a random direction; `inputs` follow the points."""
     weights = {name: weight.detach() for name, weight in network.named_parameters()}
-    along = {name: _direction(weight) for name, weight in weights.items()}
+    directions = {name: _direction(weight) for name, weight in weights.items()}
 
     def change(h: Tensor) -> SDF:
-        moved = {name: weight + h * along[name] for name, weight in weights.items()}
-        return chunked(lambda points: torch.func.functional_call(network, moved, (points, *inputs)), 4096)
+        changed = {name: weight + h * directions[name] for name, weight in weights.items()}
+        return chunked(lambda points: torch.func.functional_call(network, changed, (points, *inputs)), 4096)
 
     return change
 
 
 def own_changes(field: SDF) -> dict[str, Change]:
-    """The weights of a network, code and weights of one shape of a decoder; of other callables nothing is known."""
+    """Returns the changes of a network's weights, or of a decoder's code and weights; none for other callables."""
     if isinstance(field, nn.Module):
         return {"weights": weight_change(field)}
     if isinstance(field, ShapeField) and field.code is not None:
@@ -104,7 +107,7 @@ def own_changes(field: SDF) -> dict[str, Change]:
 
 
 def in_double(field: SDF) -> SDF:
-    """The same field in float64, where it is a network or one shape of a decoder; others as they are."""
+    """Returns a float64 copy of a network or of a decoder's shape, and any other callable as it is."""
     if isinstance(field, nn.Module):
         return deepcopy(field).double().requires_grad_(False)
     if isinstance(field, ShapeField) and field.code is not None:
@@ -112,28 +115,29 @@ def in_double(field: SDF) -> SDF:
     return field
 
 
-def _posed(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
+def _move_pose(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
     return sdf, replace(camera, T_world_camera=camera.T_world_camera @ torch.linalg.matrix_exp(h * generator))
 
 
-def _seen(sdf: SDF, camera: Camera, change: Tensor, h: Tensor) -> tuple[SDF, Camera]:
+def _change_intrinsics(sdf: SDF, camera: Camera, change: Tensor, h: Tensor) -> tuple[SDF, Camera]:
     return sdf, replace(camera, intrinsics=camera.intrinsics + h * change)
 
 
-def _put(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
+def _move_shape(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
     return placed(sdf, torch.linalg.matrix_exp(h * generator)), camera
 
 
-def _turns(like: Tensor) -> dict[str, Tensor]:
-    """Generators of rotations: e × ·."""
-    turns = {}
+def _rotations(like: Tensor) -> dict[str, Tensor]:
+    """Returns the generators of rotations, e × ·."""
+    generators = {}
     for k, axis in enumerate(AXES):
-        turns[axis] = like.new_zeros(4, 4)
-        turns[axis][(k + 2) % 3, (k + 1) % 3], turns[axis][(k + 1) % 3, (k + 2) % 3] = 1, -1
-    return turns
+        generators[axis] = like.new_zeros(4, 4)
+        generators[axis][(k + 2) % 3, (k + 1) % 3] = 1
+        generators[axis][(k + 1) % 3, (k + 2) % 3] = -1
+    return generators
 
 
-def _shifts(like: Tensor) -> dict[str, Tensor]:
+def _translations(like: Tensor) -> dict[str, Tensor]:
     return {axis: torch.outer(_unit(like, 4, k), _unit(like, 4, 3)) for k, axis in enumerate(AXES)}
 
 
@@ -142,6 +146,6 @@ def _unit(like: Tensor, length: int, k: int) -> Tensor:
 
 
 def _direction(like: Tensor) -> Tensor:
-    """A random one, the same each time, as long as what it changes; of length 1 where that is zero."""
+    """Returns a random direction, the same each time, with the norm of `like`, or norm 1 where that is zero."""
     direction = torch.randn(like.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64).to(like)
     return direction / direction.norm() * (like.norm() if like.any() else 1.0)

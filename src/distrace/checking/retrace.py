@@ -1,4 +1,4 @@
-"""A traced view, seen again of a moved field or by a moved camera: as the renderer attaches it, and traced anew."""
+"""A traced view, rendered again for a moved field or camera: attached as the renderer does, or retraced."""
 
 from dataclasses import dataclass, replace
 
@@ -16,22 +16,22 @@ from distrace.render import Buffers
 from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig, sphere_trace
 
 CAREFUL = TraceConfig(steps=300, step_scale=1.0, coarse_levels=0)
-CHORDS = 3
-ROUNDS = 4  # in which a minimum is enclosed
-REACH = 50  # steps that a zero or a minimum may move by
-EDGE = 1e-3  # a minimum closer to the bounds is none
-MOST = 128  # rays that pass by; a minimum costs several times what a zero does
+CHORDS = 3  # steps of the chord method towards a root
+ROUNDS = 4  # of bracketing a minimum
+REACH = 50  # difference steps that a minimum may move by
+EDGE = 1e-3  # radii: a minimum closer to the bounds counts as none
+MOST_MISSES = 128  # rays whose clearance is compared; a minimum costs several times what a root does
 
 
 @dataclass(frozen=True)
 class Precision:
-    """What can be told of derivatives in numbers of a kind."""
+    """The steps and tolerances that a floating-point type allows."""
 
     dtype: torch.dtype
-    step: float
-    zero: float  # to which distances are found
-    tolerance: float  # relative errors up to which derivatives agree, and one-sided differences make no kink
-    least: float  # derivatives below it are measured against it
+    step: float  # of the differences, in h
+    zero: float  # error of a root, in radii
+    tolerance: float  # relative: derivatives agree up to it, and one-sided differences that differ more make a kink
+    least: float  # the scale of relative errors is never below it
 
 
 DOUBLE = Precision(torch.float64, step=1e-6, zero=1e-11, tolerance=1e-3, least=1e-3)
@@ -40,63 +40,65 @@ SINGLE = Precision(torch.float32, step=2e-3, zero=1e-5, tolerance=5e-2, least=5e
 
 @dataclass(frozen=True)
 class Retraced:
-    """Where the rays of a camera hit a field, and where the others come closest to it."""
+    """The hits of a camera's rays on a field, and the minima of the field on rays that miss."""
 
     trace: Trace
     slope: Float[Tensor, "hits"]  # of f along the ray
-    passing: Bool[Tensor, "height width"]  # some rays that enter the bounds and hit nothing
-    closest: Float[Tensor, "misses"]  # the least value on them; NaN where that is on the bounds
+    passing: Bool[Tensor, "height width"]  # at most MOST_MISSES rays that enter the bounds and miss
+    closest: Float[Tensor, "misses"]  # distance of the minimum on them; NaN where it lies on the bounds
     radius: float
     precision: Precision
 
     @staticmethod
     def of(sdf: SDF, camera: Camera, radius: float, precision: Precision) -> "Retraced":
-        """Raises `ValueError` where the camera sees nothing of the shape."""
+        """Traces the view. Raises `ValueError` where no ray hits the shape."""
         rays = camera.rays()
         bounds = meet_sphere(rays, radius)
         trace = sphere_trace(sdf, rays, bounds, CAREFUL)
         if not trace.hit.any():
             raise ValueError("the camera sees nothing of this shape; there is no derivative to check")
-        trace, slope = _exact(sdf, camera, trace, precision)
-        passing = thinned((trace.outcome == Outcome.ESCAPED) & bounds.meets, MOST)
+        trace, slope = _refined(sdf, camera, trace, precision)
+        passing = thinned((trace.outcome == Outcome.ESCAPED) & bounds.meets, MOST_MISSES)
         trace = replace(trace, closest=trace.closest.masked_fill(~(passing | trace.hit), torch.inf))
-        missing, within = rays[passing], Bounds(bounds.near[passing], bounds.far[passing])
-        rough = surface.minimum(sdf, missing, trace.closest[passing], within)
-        closest = surface.minimum(sdf, missing, rough, within, reach=EDGE, refine=2 * ROUNDS)
-        outside = (closest - within.near < EDGE) | (within.far - closest < EDGE)
-        return Retraced(trace, slope, passing, closest.masked_fill(outside, torch.nan), radius, precision)
+        misses = rays[passing]
+        within = Bounds(bounds.near[passing], bounds.far[passing])
+        rough = surface.minimum(sdf, misses, trace.closest[passing], within)
+        closest = surface.minimum(sdf, misses, rough, within, reach=EDGE, refine=2 * ROUNDS)
+        on_bounds = (closest - within.near < EDGE) | (within.far - closest < EDGE)
+        return Retraced(trace, slope, passing, closest.masked_fill(on_bounds, torch.nan), radius, precision)
 
     def attached(self, sdf: SDF, camera: Camera) -> Images:
-        """By the renderer, from the trace as it was: differentiable."""
+        """Returns the renderer's images on the trace's hits and minima, differentiable in field and camera."""
         buffers = Buffers(sdf, camera.rays(), camera.cosines(), self.trace, self.radius)
-        return self._hits(buffers) | {"clearance": buffers.clearance[self.passing]}
+        return self._hit_images(buffers) | {"clearance": buffers.clearance[self.passing]}
 
     @torch.no_grad()
-    def traced_anew(self, sdf: SDF, camera: Camera) -> Images:
-        """Of the zeros and minima beside those of the trace; NaN where there are none."""
-        least = least_beside(sdf, camera.rays()[self.passing], self.closest, REACH * self.precision.step)
-        return self.hits_anew(sdf, camera) | {"clearance": least}
+    def retraced(self, sdf: SDF, camera: Camera) -> Images:
+        """Returns the images on the roots and minima next to the trace's; NaN where there are none."""
+        least = minimum_near(sdf, camera.rays()[self.passing], self.closest, REACH * self.precision.step)
+        return self.retraced_hits(sdf, camera) | {"clearance": least}
 
     @torch.no_grad()
-    def hits_anew(self, sdf: SDF, camera: Camera) -> Images:
-        """The same, but for the clearance."""
-        rays, hit = camera.rays(), self.trace.hit
-        found = zero_beside(sdf, rays[hit], self.trace.distance[hit], self.slope, self.precision.zero)
-        trace = replace(self.trace, distance=self.trace.distance.masked_scatter(hit, found))
-        return self._hits(Buffers(sdf, rays, camera.cosines(), trace, self.radius))
+    def retraced_hits(self, sdf: SDF, camera: Camera) -> Images:
+        """Returns the images of `retraced` without the clearance."""
+        rays = camera.rays()
+        hit = self.trace.hit
+        roots = root_near(sdf, rays[hit], self.trace.distance[hit], self.slope, self.precision.zero)
+        trace = replace(self.trace, distance=self.trace.distance.masked_scatter(hit, roots))
+        return self._hit_images(Buffers(sdf, rays, camera.cosines(), trace, self.radius))
 
     def pixels(self, quantity: str) -> Tensor:
-        """The (x, y) of a quantity's elements."""
+        """Returns the (x, y) of a quantity's elements."""
         return (self.passing if quantity == "clearance" else self.trace.hit).nonzero().flip(-1)
 
-    def _hits(self, buffers: Buffers) -> Images:
+    def _hit_images(self, buffers: Buffers) -> Images:
         hit = self.trace.hit
-        flat = {"distance": buffers.distance[hit], "depth": buffers.depth[hit]}
-        return flat | {"hit points": buffers.points, "normal": buffers.normal[hit]}
+        images = {"distance": buffers.distance[hit], "depth": buffers.depth[hit]}
+        return images | {"hit points": buffers.points, "normal": buffers.normal[hit]}
 
 
 @torch.no_grad()
-def zero_beside(
+def root_near(
     sdf: SDF,
     rays: Rays,
     distance: Float[Tensor, "*batch"],
@@ -104,38 +106,40 @@ def zero_beside(
     precision: float,
     chords: int = CHORDS,
 ) -> Float[Tensor, "*batch"]:
-    """The zero of f on each ray beside a distance at which f has a slope; NaN where chords do not end at one."""
+    """Returns the root of f next to a distance by the chord method with a fixed slope; NaN without convergence."""
     last = distance
     for _ in range(chords):
-        last, distance = distance, distance - sdf(rays.at(distance)) / slope
+        last = distance
+        distance = distance - sdf(rays.at(distance)) / slope
     return distance.masked_fill(~((distance - last).abs() < precision), torch.nan)
 
 
 @torch.no_grad()
-def least_beside(sdf: SDF, rays: Rays, closest: Float[Tensor, "n"], reach: float) -> Float[Tensor, "n"]:
-    """The least value of f on each ray beside a distance: where the lines on both sides of the minimum cross.
+def minimum_near(sdf: SDF, rays: Rays, closest: Float[Tensor, "n"], reach: float) -> Float[Tensor, "n"]:
+    """Returns the least value of f next to a distance: where the lines on both sides of the minimum cross.
 
-    A network of ReLUs is linear between kinks, and then that is its minimum, which no sample meets.
+    A ReLU network is linear between kinks. Its minimum is that crossing, which no sample meets.
     """
     t, value = surface.minimum_and_value(sdf, rays, closest, reach=reach, refine=ROUNDS)
     w = 3 * reach / 5**ROUNDS
-    far_left, left, right, far_right = (sdf(rays.at(t + k * w)) for k in (-2, -1, 1, 2))
-    falls, rises = (left - far_left) / w, (far_right - right) / w
+    left_outer, left, right, right_outer = (sdf(rays.at(t + k * w)) for k in (-2, -1, 1, 2))
+    falls = (left - left_outer) / w
+    rises = (right_outer - right) / w
     encloses = (falls < 0) & (rises > 0)
     offset = (left - right + (falls + rises) * w) / torch.where(encloses, rises - falls, 1.0)
     return torch.where(encloses, left + falls * (offset + w), value)
 
 
 @torch.no_grad()
-def _exact(sdf: SDF, camera: Camera, trace: Trace, precision: Precision) -> tuple[Trace, Tensor]:
-    """The trace with its hits at the zeros of f, without those that have none, and the slopes of f along the rays."""
-    rays, hit = camera.rays(), trace.hit
-    rays, distance = rays[hit], trace.distance[hit]
-    _, gradient = value_and_gradient(sdf, rays.at(distance))
+def _refined(sdf: SDF, camera: Camera, trace: Trace, precision: Precision) -> tuple[Trace, Float[Tensor, "hits"]]:
+    """Returns the trace with its hits at roots of f, and the slopes of f there; hits without a root are EXHAUSTED."""
+    hit = trace.hit
+    rays = camera.rays()[hit]
+    _, gradient = value_and_gradient(sdf, rays.at(trace.distance[hit]))
     slope = (gradient * rays.directions).sum(-1)
-    distance = zero_beside(sdf, rays, distance, slope, precision.zero)
-    lost = distance.isnan()
+    roots = root_near(sdf, rays, trace.distance[hit], slope, precision.zero)
+    lost = roots.isnan()
     outcome = trace.outcome.masked_scatter(hit, torch.where(lost, int(Outcome.EXHAUSTED), trace.outcome[hit]))
-    exact = trace.distance.masked_scatter(hit, distance.masked_fill(lost, torch.inf))
-    closest = trace.closest.masked_scatter(hit, torch.where(lost, trace.closest[hit], distance))
-    return replace(trace, distance=exact, outcome=outcome, closest=closest), slope[~lost]
+    distance = trace.distance.masked_scatter(hit, roots.masked_fill(lost, torch.inf))
+    closest = trace.closest.masked_scatter(hit, torch.where(lost, trace.closest[hit], roots))
+    return replace(trace, distance=distance, outcome=outcome, closest=closest), slope[~lost]

@@ -7,11 +7,11 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from distrace.benchmarks import ablation, backward, derivatives, pages
+from distrace.benchmarks import ablation, derivatives, pages
 from distrace.benchmarks.measuring import measure, poster_view
-from distrace.checkpoints.model import Model
+from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
-from distrace.cli.common import Flag, opened, show_table
+from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, origin, progress, start
 from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
@@ -40,9 +40,8 @@ class Bench:
     code: int = 0  # which training shape
     size: int = 512  # pixels along each side, of `trace` and the times of `gradients`
     repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
-    views: int = 60  # of `views`: random views of each model, and a fifth as many of each family of fields
+    views: int = 60  # of `views`: random views of each model
     sizes: tuple[int, int] = (128, 512)  # of `views`: the smallest and the largest image, in pixels along each side
-    fields: Flag = False  # of `views`: analytic fields, too; without MODEL, these alone
     strategy: str | None = None  # of `views`: as in `distrace render`; by default what `distrace.render` does unasked
     seed: int = 0  # of `views`
     references: Path | None = None  # of `views`: a folder to keep references in, which take most of the time
@@ -51,8 +50,8 @@ class Bench:
     def run(self) -> None:
         run = start(self.out, self.device)
         if self.what == "views":
-            drawn = self.models, self.fields, self.views, self.sizes, self.seed, self.strategy
-            bench_views(run, Plan(*drawn, kept=self.references))
+            names = self.models or bundled_models()
+            bench_views(run, Plan(names, self.views, self.sizes, self.seed, self.strategy, self.references))
         else:
             getattr(self, f"_{self.what}")(run, opened(self.model, run.device))
 
@@ -86,7 +85,7 @@ class Bench:
                     measured.append((row, ratio.numpy()))
                     bar.advance(f"{row.field} by {row.parameter}, {row.method}")
         rows, ratios = zip(*measured)
-        timings = backward.timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
+        timings = derivatives.timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
         save_text(run.out / "index.html", pages.gradients_page(rows, ratios, timings))
         facts = rows_of(self.model, rows)
         times = rows_of(self.model, timings)

@@ -1,4 +1,4 @@
-"""Networks before any training, whose surface is about a sphere (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+"""Networks without training whose surface is about a sphere (Atzmon and Lipman, *SAL*, CVPR 2020)."""
 
 import torch
 from torch import nn
@@ -10,13 +10,13 @@ RADIUS = 0.6
 
 
 def ball(layers: int, width: int, device: torch.device | str = "cpu") -> SDF:
-    """The field of a network before any training."""
+    """Returns the field of an untrained network, about the distance to a sphere of RADIUS."""
     specs = NetworkSpecs(dims=(width,) * layers, code_length=1, latent_in=(), norm_layers=())
     return ball_decoder(specs, RADIUS).to(device).field(torch.zeros(1, device=device))
 
 
 def ball_decoder(specs: NetworkSpecs, radius: float) -> Decoder:
-    """About the distance to a sphere before any training (Atzmon and Lipman, *SAL*, CVPR 2020)."""
+    """Returns an untrained decoder that is about the distance to a sphere."""
     decoder = Decoder(specs)
     generator = torch.Generator().manual_seed(0)
     linears = [module for module in decoder.modules() if isinstance(module, nn.Linear)]

@@ -1,0 +1,1 @@
+"""Fields that are hard to trace, and networks without training."""
