@@ -5,11 +5,11 @@ import torch
 from photographed import ball
 from test_fit_photos import ring
 
-from distrace.photos.cross_view_consistency import Consensus
+from distrace.photos.cross_view_consistency import CrossViewConsistency
 
 SIZE = 48
 CAMERAS = ring(size=SIZE)
-CONSENSUS = Consensus.of(CAMERAS)
+CONSISTENCY = CrossViewConsistency.of(CAMERAS)
 
 
 @pytest.fixture(scope="module")
@@ -21,7 +21,7 @@ def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept(masks: list[
     likely = list(masks)
     likely[3] = likely[3].clone()
     likely[3][:8, :8] = True  # a neighbour of the same colour
-    shown = CONSENSUS.agreed(likely)
+    shown = CONSISTENCY.silhouettes(likely)
     assert not shown[3][:8, :8].any()
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
@@ -29,10 +29,10 @@ def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept(masks: list[
 def test_what_one_view_lacks_is_kept(masks: list[torch.Tensor]) -> None:
     likely = list(masks)
     likely[3] = torch.zeros_like(likely[3])
-    shown = CONSENSUS.agreed(likely)
+    shown = CONSISTENCY.silhouettes(likely)
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
 
 def test_without_anything_likely_nothing_is_possible() -> None:
-    shown = CONSENSUS.agreed([torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
+    shown = CONSISTENCY.silhouettes([torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
     assert not torch.stack(shown).any()

@@ -19,7 +19,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.errors import explained
-from distrace.photos.stereo_pairs import partners
+from distrace.photos.stereo_pairs import neighbour_views
 
 PARTNERS = 2  # of each view
 LARGER = 2  # times: matches are found to about a sixteenth of a pixel only where images are smooth
@@ -93,7 +93,7 @@ def stereo_points(photographs: Sequence[Photograph]) -> Float[np.ndarray, "n 3"]
 
 
 def _pairs(photographs: Sequence[Photograph]) -> Iterator[Rectified]:
-    for number, others in enumerate(partners([each.camera for each in photographs], PARTNERS).tolist()):
+    for number, others in enumerate(neighbour_views([each.camera for each in photographs], PARTNERS).tolist()):
         for other in others:
             if other >= 0:
                 yield Rectified.of(photographs[number], photographs[other])

@@ -1,6 +1,6 @@
-"""Values at the corners of ever finer grids, looked up and blended: details that smooth networks are slow to learn.
+"""A multiresolution hash encoding: details that smooth networks are slow to learn.
 
-A multiresolution hash encoding (Müller et al., *Instant neural graphics primitives*, SIGGRAPH 2022, section 3).
+Müller et al., *Instant neural graphics primitives with a multiresolution hash encoding*, SIGGRAPH 2022, section 3.
 """
 
 from dataclasses import dataclass
@@ -11,13 +11,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 PRIMES = (1, 2654435761, 805459861)  # of the hash, as in the paper
-STRENGTH = 10.0  # of what is looked up: entries are met seldom, and learn so much faster than a network's weights
+OUTPUT_SCALE = 10.0  # × the entries: each gets few gradients, and learns so much faster than a network's weights
 CORNERS = torch.cartesian_prod(*[torch.arange(2)] * 3)  # of a cell
 
 
 @dataclass(frozen=True)
 class GridSpecs:
-    """Sizes of the tables. Their entries say nothing without them."""
+    """Sizes of the tables, which a checkpoint needs beside their entries."""
 
     levels: int = 10
     coarsest: int = 16  # cells along the cube around the unit sphere …
@@ -31,13 +31,13 @@ class GridSpecs:
 
     @property
     def cells(self) -> list[int]:
-        """Along the cube, level by level."""
+        """Along the cube, for each level."""
         growth = (self.finest / self.coarsest) ** (1 / max(self.levels - 1, 1))
         return [round(self.coarsest * growth**level) for level in range(self.levels)]
 
 
 class HashGrid(nn.Module):
-    """Points of [−1, 1]³ → `levels` × `channels` values, linear between corners; beyond, those of the sides."""
+    """Points of [−1, 1]³ → `levels` × `channels` values, trilinear in each cell; constant beyond the cube."""
 
     corners: Int[Tensor, "8 3"]
 
@@ -48,17 +48,18 @@ class HashGrid(nn.Module):
         self.register_buffer("corners", CORNERS, persistent=False)
 
     def forward(self, points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch values"]:
-        found = [self._level(level, cells, points) for level, cells in enumerate(self.specs.cells)]
-        return STRENGTH * torch.cat(found, dim=-1)
+        levels = [self._interpolate(level, cells, points) for level, cells in enumerate(self.specs.cells)]
+        return OUTPUT_SCALE * torch.cat(levels, dim=-1)
 
-    def _level(self, level: int, cells: int, points: Tensor) -> Tensor:
-        place = (points.clamp(-1, 1) + 1) / 2 * cells
-        first = place.detach().floor().clamp_max(cells - 1)
-        within = (place - first)[..., None, :]
-        share = torch.where(self.corners.bool(), within, 1 - within).prod(-1)
+    def _interpolate(self, level: int, cells: int, points: Tensor) -> Tensor:
+        """One level's values [*batch, channels]."""
+        position = (points.clamp(-1, 1) + 1) / 2 * cells
+        first = position.detach().floor().clamp_max(cells - 1)
+        within = (position - first)[..., None, :]
+        weight = torch.where(self.corners.bool(), within, 1 - within).prod(-1)
         entry = self._entry(first.long()[..., None, :] + self.corners, cells)
         values = F.embedding(level * self.specs.entries + entry, self.tables)
-        return (share[..., None] * values).sum(-2)
+        return (weight[..., None] * values).sum(-2)
 
     def _entry(self, corner: Int[Tensor, "*batch 3"], cells: int) -> Int[Tensor, "*batch"]:
         """A corner's own entry where there are enough, otherwise one by the paper's hash."""
