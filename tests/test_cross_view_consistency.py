@@ -5,7 +5,7 @@ import torch
 from photographed import ball
 from test_fit_photos import ring
 
-from distrace.photos.cross_view_consistency import CrossViewConsistency
+from distrace.photos.visual_hull import CrossViewConsistency
 
 SIZE = 48
 CAMERAS = ring(size=SIZE)

@@ -17,8 +17,8 @@ from distrace.fields.decoder import Decoder
 from distrace.photos.colour_segmentation import ColourModel, appearance
 from distrace.photos.fit_photos import PhotoConfig, fit_photos
 from distrace.photos.initialisation import Initialiser
-from distrace.photos.pyramid import ComparisonConfig, PyramidLevel
-from distrace.photos.residuals import PhotoProblem, PlacedShape
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PhotoProblem, PlacedShape
 from distrace.photos.selection import inconsistencies, view_agreements
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
 from distrace.pose import Similarity

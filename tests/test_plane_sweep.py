@@ -12,8 +12,6 @@ from distrace.data.photograph import Photograph
 from distrace.fields.base import SDF
 from distrace.fields.primitives import difference, sphere
 from distrace.photos.visual_hull import visual_hull
-from distrace.reconstruction import initialisation
-from distrace.reconstruction.initialisation import informative_depths, initialise
 from distrace.reconstruction.multiview_depth import (
     DEPTH_ERROR,
     NO_DEPTHS,
@@ -22,8 +20,9 @@ from distrace.reconstruction.multiview_depth import (
     depth_loss,
     plane_sweep,
 )
+from distrace.reconstruction.networks import SurfaceSpecs
+from distrace.reconstruction.reconstruct import informative_depths, initialise
 from distrace.reconstruction.state import ReconstructConfig, Reconstruction
-from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.render import render
 
 BOWL = difference(sphere(0.8), sphere(0.55, torch.tensor([0.0, 0.0, 0.6])))  # hollow to z = 0.05
@@ -104,10 +103,10 @@ def test_a_network_begins_with_a_hollow_that_no_outline_shows(bowl: list[Photogr
 def test_depths_are_used_where_outlines_do_not_tell_the_shape(
     bowl: list[Photograph], depths: ConsistentDepths, told: list[DepthMap], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(initialisation, "plane_sweep", lambda _: told)
+    monkeypatch.setattr("distrace.reconstruction.reconstruct.plane_sweep", lambda _: told)
     assert len(informative_depths(bowl, visual_hull(bowl))) == len(depths)
     assert informative_depths(bowl, BOWL) is NO_DEPTHS
-    monkeypatch.setattr(initialisation, "plane_sweep", lambda _: [])
+    monkeypatch.setattr("distrace.reconstruction.reconstruct.plane_sweep", lambda _: [])
     assert informative_depths(bowl, sphere(0.8)) is NO_DEPTHS
 
 

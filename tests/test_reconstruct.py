@@ -30,12 +30,19 @@ from distrace.fields.primitives import box, sphere, torus
 from distrace.photos.visual_hull import mask_overlaps, visual_hull
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
-from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
-from distrace.reconstruction.initialisation import initialise
 from distrace.reconstruction.losses import MARCH, PixelSampler, loss_terms, surface_colours
 from distrace.reconstruction.matching import PatchMatching
 from distrace.reconstruction.multiview_depth import NO_DEPTHS
-from distrace.reconstruction.reconstruct import reconstruct
+from distrace.reconstruction.networks import (
+    ColourNetwork,
+    CountedSurface,
+    GridSpecs,
+    HashGrid,
+    SurfaceNetwork,
+    SurfaceSpecs,
+    squareplus,
+)
+from distrace.reconstruction.reconstruct import initialise, reconstruct
 from distrace.reconstruction.state import (
     ReconstructConfig,
     Reconstruction,
@@ -43,13 +50,6 @@ from distrace.reconstruction.state import (
     load_reconstruction,
     rigid_motions,
     save_reconstruction,
-)
-from distrace.reconstruction.surface_network import (
-    ColourNetwork,
-    CountedSurface,
-    SurfaceNetwork,
-    SurfaceSpecs,
-    squareplus,
 )
 from distrace.render import render
 from distrace.report.reconstruction_page import judged

@@ -172,7 +172,7 @@ def _found(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float[
     if trial.method == "nearest":
         level = PyramidLevel.of(views, config.levels[0], config.comparison)
         best = Initialiser(model.decoder, prior).ranked(level, config.comparison, still)[0]
-        return prior.code(best[1]), still
+        return prior.code(best), still
     place = disturbed(hash_of(clip["shape"])) if config.comparison.fit_place else still
     *_, last = fit_photos(model.decoder, views, prior, config, place)
     return last.code, last.place

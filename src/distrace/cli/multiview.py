@@ -17,8 +17,7 @@ from distrace.files import save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
-from distrace.photos.pyramid import ComparisonConfig
-from distrace.photos.residuals import PlacedShape
+from distrace.photos.residuals import ComparisonConfig, PlacedShape
 from distrace.photos.selection import ViewAgreement, view_agreements
 from distrace.prior import prior_of
 from distrace.report.views_page import forming, views_page

@@ -15,9 +15,9 @@ from distrace.data.photographs import load_photographs, notes
 from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
 from distrace.photos.visual_hull import MaskOverlap, mask_overlaps, visual_hull
-from distrace.reconstruction.initialisation import informative_depths, initialise
 from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths
-from distrace.reconstruction.reconstruct import reconstruct
+from distrace.reconstruction.networks import SurfaceSpecs
+from distrace.reconstruction.reconstruct import informative_depths, initialise, reconstruct
 from distrace.reconstruction.state import (
     ReconstructConfig,
     Reconstruction,
@@ -25,7 +25,6 @@ from distrace.reconstruction.state import (
     load_reconstruction,
     save_reconstruction,
 )
-from distrace.reconstruction.surface_network import SurfaceSpecs
 from distrace.report.reconstruction_page import judged
 from distrace.shading import save_png
 from distrace.threads import flushed_denormals

@@ -16,8 +16,8 @@ from distrace.fields.decoder import Decoder
 from distrace.fitting.multistart import Starts, Step, best_of, stages_of
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
 from distrace.photos.initialisation import Initialiser
-from distrace.photos.pyramid import ComparisonConfig, PyramidLevel
-from distrace.photos.residuals import PlacedShape
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PlacedShape
 from distrace.photos.selection import inconsistencies
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -150,16 +150,11 @@ class _Fit:
                 damping = solution.damping
                 iteration += 1
                 terms = problem.terms(solution.state, solution.residuals)
-                yield PhotoStep(
-                    start,
-                    iteration,
-                    loss=sum(terms.values()),
-                    terms=terms,
-                    code=prior.code(shape.w),
-                    seconds=time.perf_counter() - began,
-                    evaluations=problem.evaluations - counted,
-                    place=shape.place,
-                )
+                loss = sum(terms.values())
+                seconds = time.perf_counter() - began
+                evaluations = problem.evaluations - counted
+                code = prior.code(shape.w)
+                yield PhotoStep(start, iteration, loss, terms, code, seconds, evaluations, place=shape.place)
                 began = time.perf_counter()
                 counted = problem.evaluations
 

@@ -13,8 +13,8 @@ from distrace.data.photograph import Photograph
 from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
 from distrace.photos.colour_segmentation import ColourModel
-from distrace.photos.pyramid import ComparisonConfig, PyramidLevel
-from distrace.photos.residuals import PlacedShape
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PlacedShape
 from distrace.photos.visual_hull import carve
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -60,24 +60,22 @@ class Initialiser:
 
     def ranked(
         self, level: PyramidLevel, config: ComparisonConfig, place: Similarity
-    ) -> list[tuple[float, Float[Tensor, "dimensions"]]]:
-        """Losses and coordinates of the best training shapes, the least loss first; all are screened on fewer rays."""
+    ) -> list[Float[Tensor, "dimensions"]]:
+        """Coordinates of the best training shapes, the least loss first; all are screened on fewer rays."""
         coordinates = [self.prior.coordinates(code) for code in self.prior.codes]
         for rays in (min(SCREENING_RAYS, config.rays), config.rays):
             losses = [self._loss(level, replace(config, rays=rays), PlacedShape(w, place)) for w in coordinates]
             order = sorted(range(len(coordinates)), key=lambda number: losses[number])
             count = max(len(self.prior.codes) // SCREENED_SHARE, SCREENED_LEAST)
             coordinates = [coordinates[number] for number in order[:count]]
-        return [(losses[number], w) for number, w in zip(order, coordinates)]
+        return coordinates
 
     def starts(
         self, level: PyramidLevel, config: ComparisonConfig, place: Similarity, count: int
     ) -> list[Float[Tensor, "dimensions"]]:
         """Coordinates to start from: the mean's, those of the best training shapes, and a draw from the prior."""
-        nearest = []
-        if count > 2:
-            ranked = self.ranked(level, replace(config, rays=RANKING_RAYS), place)
-            nearest = [w for _, w in ranked[: count - 2]]
+        ranked = self.ranked(level, replace(config, rays=RANKING_RAYS), place) if count > 2 else []
+        nearest = ranked[: max(count - 2, 0)]
         draws = [self.prior.start(k, self.seed) for k in range(1, count - len(nearest))]
         return [self.prior.start(0, self.seed), *nearest, *draws]
 
@@ -110,8 +108,13 @@ def locate(level: PyramidLevel, typical: Sequence[SDF], place: Similarity) -> Si
     ]
     masked = masked[:: -(-len(masked) // HULL_VIEWS)]
     coarse = [view.at_most(SILHOUETTE_SIZE) for view in masked]
-    extents = [_hull_extent([_with_silhouette(view, sdf, place) for view in coarse], place) for sdf in typical]
-    extents = [extent for extent in extents if extent is not None]
+    extents = []
+    for sdf in typical:
+        with torch.no_grad():
+            silhouettes = [render(sdf, place.camera_in_object(view.camera)).mask for view in coarse]
+        views = [replace(view, mask=mask) for view, mask in zip(coarse, silhouettes, strict=True)]
+        if extent := _hull_extent(views, place):
+            extents.append(extent)
     observed = _hull_extent(masked, place)
     if not extents or observed is None:
         return place
@@ -131,12 +134,6 @@ def _hull_extent(views: Sequence[Photograph], place: Similarity) -> tuple[Float[
     points = centres[solid] @ place.rotation
     middle = (points.amin(0) + points.amax(0)) / 2
     return place.turned(middle), (points - middle).norm(dim=-1).max()
-
-
-@torch.no_grad()
-def _with_silhouette(view: Photograph, sdf: SDF, place: Similarity) -> Photograph:
-    """The view with a shape's silhouette as its mask."""
-    return replace(view, mask=render(sdf, place.camera_in_object(view.camera)).mask)
 
 
 def _object_masks(level: PyramidLevel) -> list[Bool[Tensor, "height width"]]:

@@ -12,9 +12,9 @@ from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
 from distrace.fitting.ray_sampling import drawn
 from distrace.photos.colour_segmentation import ColourModel, appearance
-from distrace.photos.cross_view_consistency import CrossViewConsistency
-from distrace.photos.residuals import MARCH, PhotoProblem, PhotoWeights, PlacedShape, RayObservations, TracedShape
+from distrace.photos.residuals import MARCH, ComparisonConfig, PhotoProblem, PlacedShape, RayObservations, TracedShape
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
+from distrace.photos.visual_hull import CrossViewConsistency
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
@@ -28,23 +28,6 @@ NEAR_SURFACE = 0.1  # background rays whose least value is larger are left out
 
 Labels = Sequence[Float[Tensor, "height width"]]
 """Each view's certainty that a pixel shows the object, up to 1, or the background, down to −1; 0 where unknown."""
-
-
-@dataclass(frozen=True)
-class ComparisonConfig:
-    """How photographs are compared."""
-
-    rays: int = 4000  # of all views
-    neighbours: int = 4  # views that each is compared with
-    weights: PhotoWeights = PhotoWeights()
-    fit_place: bool = True  # whether the placement is unknown, too
-    same_light: bool = True  # otherwise colours are compared without their local mean and contrast
-
-    def __post_init__(self) -> None:
-        if self.rays < 1 or self.neighbours < 1:
-            raise ValueError(
-                f"{self.rays} rays and {self.neighbours} neighbours were asked for; both must be at least 1"
-            )
 
 
 @dataclass(frozen=True)
@@ -123,17 +106,8 @@ class PyramidLevel:
         points = sample.rays_object[kept][compared].at(trace.distance[compared])
         rows, neighbours = self._visible(observations.view[compared], shape.place, points, sample.sdf)
         pairs = torch.stack([compared[rows], neighbours], dim=1)
-        problem = PhotoProblem(
-            sample.decoder,
-            sample.prior,
-            observations,
-            self.images,
-            pairs,
-            config.weights,
-            config.fit_place,
-            shape.place,
-            evaluations=sample.sdf.evaluations,
-        )
+        problem = PhotoProblem(sample.decoder, sample.prior, observations, self.images, pairs, config, shape.place)
+        problem.evaluations = sample.sdf.evaluations
         return problem, problem.trace(shape, TracedShape(shape, trace.closest, trace.hit, trace.hit))
 
     @torch.no_grad()

@@ -34,15 +34,24 @@ MARCH = TraceConfig(tolerance=1e-3, steps=50, least_step=2e-3)
 
 
 @dataclass(frozen=True)
-class PhotoWeights:
-    """Weights of the loss terms, and the scales of their residuals."""
+class ComparisonConfig:
+    """How photographs are compared, the weights of the loss terms, and the scales of their residuals."""
 
-    colour: float = 1.0
-    outline: float = 10.0
-    code: float = 0.02  # of the mean squared coordinate
-    place: float = 0.02  # of each number of the placement, in its deviations
+    rays: int = 4000  # of all views
+    neighbours: int = 4  # views that each is compared with
+    fit_place: bool = True  # whether the placement is unknown, too
+    same_light: bool = True  # otherwise colours are compared without their local mean and contrast
+    colour_weight: float = 1.0
+    outline_weight: float = 10.0
+    code_weight: float = 0.02  # of the mean squared coordinate
+    place_weight: float = 0.02  # of each number of the placement, in its deviations
     colour_scale: float = 0.08  # of colours from 0 to 1: larger differences count linearly
     margin: float = 0.005  # radii that the surface should stay away from background rays
+
+    def __post_init__(self) -> None:
+        if self.rays < 1 or self.neighbours < 1:
+            given = f"{self.rays} rays and {self.neighbours} neighbours"
+            raise ValueError(f"{given} were asked for; both must be at least 1")
 
 
 @dataclass(frozen=True)
@@ -85,8 +94,7 @@ class PhotoProblem:
     observations: RayObservations
     images: Sequence[GradientImage]
     pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
-    weights: PhotoWeights
-    fit_place: bool  # whether the placement is unknown, too
+    config: ComparisonConfig
     expected_place: Similarity  # the mean of the placement's prior
     outline_scale: float = 0.02  # radii: larger outline residuals count linearly
     evaluations: int = 0
@@ -116,7 +124,7 @@ class PhotoProblem:
         """The state after a step of the unknowns: coordinates, and then placement."""
         shape = state.shape
         count = len(shape.w)
-        place = shape.place.moved(step[count:]) if self.fit_place else shape.place
+        place = shape.place.moved(step[count:]) if self.config.fit_place else shape.place
         return self.trace(PlacedShape(shape.w + step[:count], place), state)
 
     def residuals(self, state: TracedShape) -> Residuals:
@@ -143,7 +151,7 @@ class PhotoProblem:
         values, gradient, by_code = derivatives(self.decoder, points, self.prior.code(state.shape.w))
         self.evaluations += len(values)
         by_unknowns = by_code @ self.prior.basis
-        if self.fit_place:
+        if self.config.fit_place:
             by_unknowns = torch.cat([by_unknowns, place.change(points, gradient)], dim=1)
         slope = (place.turned(gradient) * rays.directions).sum(-1)
         row_of_ray = torch.full_like(state.hit, -1, dtype=torch.int64)
@@ -168,9 +176,9 @@ class PhotoProblem:
             along_ray[in_view] = (gradients * motion[:, None]).sum(-1)
         slope = points.slope[rows]
         slide = -points.scale / slope.clamp_max(-LEAST_SLOPE) * (state.hit[rays] & (slope < 0))
-        scale = self.weights.colour_scale
+        scale = self.config.colour_scale
         jacobian = (along_ray * slide[:, None] / scale)[..., None] * points.by_unknowns[rows][:, None]
-        weights = values.new_full((values.numel(),), self.weights.colour / max(values.numel(), 1))
+        weights = values.new_full((values.numel(),), self.config.colour_weight / max(values.numel(), 1))
         return Residuals((values / scale).flatten(), jacobian.flatten(0, 1), weights)
 
     def _outlines(self, state: TracedShape, points: "_SurfacePoints") -> Residuals:
@@ -182,22 +190,23 @@ class PhotoProblem:
         rows = points.row_of_ray[wrong]
         label = self.observations.label[wrong]
         least = points.values[rows]
-        excess = torch.where(label > 0, least.clamp_min(0), (least - self.weights.margin).clamp_max(0))
+        excess = torch.where(label > 0, least.clamp_min(0), (least - self.config.margin).clamp_max(0))
         excess = excess / self.outline_scale
         shrink = 1 / (1 + (excess / OUTLINE_SATURATION).square()).sqrt()
         by_value = (shrink**3 / self.outline_scale).masked_fill(excess == 0, 0.0)
-        weights = self.weights.outline * label.abs() / len(state.hit)
+        weights = self.config.outline_weight * label.abs() / len(state.hit)
         return Residuals(excess * shrink, points.by_unknowns[rows] * by_value[:, None], weights)
 
     def _prior(self, state: TracedShape) -> Residuals:
         """The code's coordinates, and the placement's distance from the expected one."""
+        config = self.config
         w = state.shape.w
-        count = len(PLACE_DEVIATIONS)
         deviations = torch.tensor(PLACE_DEVIATIONS).to(w)
         place = state.shape.place.step_from(self.expected_place) / deviations
-        jacobian = torch.block_diag(torch.eye(len(w)).to(w), (1 / deviations).diag()[:, : count * self.fit_place])
+        by_place = (1 / deviations).diag()[:, : len(place) * config.fit_place]
+        jacobian = torch.block_diag(torch.eye(len(w)).to(w), by_place)
         weights = torch.cat(
-            [w.new_full((len(w),), self.weights.code / len(w)), w.new_full((count,), self.weights.place)]
+            [torch.full_like(w, config.code_weight / len(w)), torch.full_like(place, config.place_weight)]
         )
         return Residuals(SMALL * torch.cat([w, place]), SMALL * jacobian, 2 * weights / SMALL**2)
 

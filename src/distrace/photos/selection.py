@@ -11,8 +11,8 @@ from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.fields.decoder import Decoder
-from distrace.photos.pyramid import ComparisonConfig, PyramidLevel
-from distrace.photos.residuals import PhotoProblem, PlacedShape, TracedShape
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PhotoProblem, PlacedShape, TracedShape
 from distrace.prior import Prior
 
 LEAST_TERM = 1e-6  # added to either term: a shape whose outlines are all right is still judged by its colours
@@ -90,7 +90,7 @@ def view_agreements(
 def _pairwise_differences(problem: PhotoProblem, state: TracedShape, count: int) -> Float[Tensor, "views views"]:
     """The median difference of colour between each two views; NaN where they see no point in common."""
     values = problem.residuals(state).values[: 3 * len(problem.pairs)].reshape(-1, 3)
-    differences = values.abs().mean(dim=-1) * problem.weights.colour_scale
+    differences = values.abs().mean(dim=-1) * problem.config.colour_scale
     first = problem.observations.view[problem.pairs[:, 0]]
     second = problem.pairs[:, 1]
     found = torch.full((count, count), torch.nan)

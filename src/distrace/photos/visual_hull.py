@@ -1,18 +1,20 @@
-"""The visual hull of masks on a grid, as a distance field, and masks that disagree with the others.
+"""Space carving by masks: the visual hull as a distance field, outlier masks, and masks that are consistent.
 
 Laurentini, *The visual hull concept for silhouette-based image understanding*, PAMI 1994.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import mean, median
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 
+from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.data.space_carving import looked_up
 from distrace.fields.base import SDF
@@ -21,9 +23,11 @@ from distrace.rays import meet_sphere
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 CELLS = 160  # along each axis of the cube around the unit sphere
+CONSISTENCY_CELLS = 48  # the same, of `CrossViewConsistency`
 LEAST_VISIBILITY = 0.25  # share of the views, and two at least, whose images must contain a cell
 WRONG_MASKS = 0.05  # share of the masks about a cell that may leave it out …
 WRONG_MASKS_SOUGHT = 0.1  # … and, one at least, where the wrong ones are sought
+INCONSISTENT_VIEWS = 0.15  # share of the views of a cell that may take it for the background: parts may look like that
 COMPARED_SIZE = 96  # pixels along the longer side, of views that are compared
 OUTLIER_FACTOR = 2.5  # × the median over views: a view whose 1 − IoU is larger is an outlier …
 LEAST_DISAGREEMENT = 0.15  # … if that is larger than this, too, …
@@ -111,7 +115,7 @@ def carve(
         inside, on_object = looked_up(photograph.camera, photograph.known_mask, centres)
         visible += inside
         left_out += inside & ~on_object
-    return centres, is_solid(visible, left_out, len(photographs), wrong, least) & (centres.norm(dim=-1) < 1)
+    return centres, _is_solid(visible, left_out, len(photographs), wrong, least) & (centres.norm(dim=-1) < 1)
 
 
 def grid_centres(cells: int, device: torch.device) -> Float[Tensor, "cells 3"]:
@@ -120,7 +124,7 @@ def grid_centres(cells: int, device: torch.device) -> Float[Tensor, "cells 3"]:
     return torch.cartesian_prod(steps, steps, steps)
 
 
-def is_solid(
+def _is_solid(
     visible: Float[Tensor, "cells"], left_out: Float[Tensor, "cells"], views: int, wrong: float, least: float = 0.0
 ) -> Bool[Tensor, "cells"]:
     """Cells that enough of the views contain, and that few of those leave out; both are counts of views."""
@@ -139,3 +143,57 @@ def _distance_field(solid: Bool[Tensor, "cells"]) -> SDF:
         return values.reshape(points.shape[:-1]).to(points)
 
     return field
+
+
+@dataclass(frozen=True)
+class CrossViewConsistency:
+    """The unit sphere's cells as each view sees them: projected once, and used for every shape.
+
+    After Campbell et al., *Automatic 3D object segmentation in multiple views using volumetric graph-cuts* (BMVC
+    2007); here the views vote in place of a graph cut.
+    """
+
+    cameras: Sequence[Camera]
+    inside: Bool[Tensor, "views cells"]
+    pixel: Int[Tensor, "views cells"]  # flat index; 0 for cells outside the image
+    depth: Float[Tensor, "views cells"]
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> "CrossViewConsistency":
+        """Projects the cells into each camera's image."""
+        centres = grid_centres(CONSISTENCY_CELLS, cameras[0].intrinsics.device)
+        centres = centres[centres.norm(dim=-1) < 1]
+        projections = []
+        for camera in cameras:
+            pixels, depth = camera.project(centres)
+            inside = camera.shows(pixels, depth)
+            column, row = pixels.masked_fill(~inside[:, None], 0.0).long().T
+            projections.append((inside, row * camera.width + column, depth))
+        return CrossViewConsistency(cameras, *(torch.stack(part) for part in zip(*projections)))
+
+    def silhouettes(self, masks: Sequence[Bool[Tensor, "_ _"]]) -> list[Bool[Tensor, "_ _"]]:
+        """The silhouettes of the cells that most of the masks, one a view, contain.
+
+        A neighbour that looks like the object in one view is not in them.
+        """
+        on_object = torch.stack([mask.reshape(-1)[pixel] for mask, pixel in zip(masks, self.pixel, strict=True)])
+        visible = self.inside.sum(0).float()
+        left_out = (self.inside & ~on_object).sum(0).float()
+        solid = _is_solid(visible, left_out, len(masks), INCONSISTENT_VIEWS)
+        return [
+            _silhouette(camera, pixel[solid & inside], depth[solid & inside])
+            for camera, inside, pixel, depth in zip(self.cameras, self.inside, self.pixel, self.depth)
+        ]
+
+
+def _silhouette(camera: Camera, pixel: Int[Tensor, "n"], depth: Float[Tensor, "n"]) -> Bool[Tensor, "height width"]:
+    """The pixels that cells cover, widened by half of the nearest cell's diagonal."""
+    covered = depth.new_zeros(camera.height, camera.width)
+    covered.view(-1)[pixel] = 1.0
+    if not len(pixel):
+        return covered.bool()
+    radius = math.sqrt(3) / CONSISTENCY_CELLS * float(camera.intrinsics[0, 0] / depth.min())
+    reach = min(math.ceil(radius), max(camera.height, camera.width))
+    for _ in range(2):  # rows and then columns take less time than a large square
+        covered = F.max_pool1d(F.pad(covered, (reach, reach)), 2 * reach + 1, 1).T
+    return covered > 0

@@ -3,8 +3,8 @@
 After IDR (Yariv et al., NeurIPS 2020, section 3).
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -16,7 +16,7 @@ from distrace.fields.base import value_and_gradient
 from distrace.fitting.ray_sampling import band
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.reconstruction.matching import PATCH_WIDTH, PatchMatching
-from distrace.reconstruction.surface_network import ColourNetwork, Surface
+from distrace.reconstruction.networks import ColourNetwork, Surface
 from distrace.surface import attach, minimum
 from distrace.tracing.sphere_tracing import Trace, TraceConfig, sphere_trace
 
@@ -40,22 +40,21 @@ class PixelRays:
     is_inner: Bool[Tensor, "n"]  # a patch about it is object, too, and can be compared
 
     def __getitem__(self, rows: Tensor) -> "PixelRays":
-        return PixelRays(self.rays[rows], *(value[rows] for value in self._values))
+        return self._mapped(lambda values: values[rows])
+
+    def to(self, device: torch.device) -> "PixelRays":
+        return self._mapped(lambda values: values.to(device))
 
     def moved(self, motions: Float[Tensor, "views 4 4"]) -> "PixelRays":
         """The rays with each view's camera moved, without those that leave the unit sphere; differentiable."""
         rotation = motions[self.view, :3, :3]
         origins = (rotation @ self.rays.origins[..., None])[..., 0] + motions[self.view, :3, 3]
         rays = Rays(origins, (rotation @ self.rays.directions[..., None])[..., 0])
-        return PixelRays(rays, *self._values)[_rows(meet_sphere(rays.detach()).meets)]
+        return replace(self, rays=rays)[_rows(meet_sphere(rays.detach()).meets)]
 
-    def to(self, device: torch.device) -> "PixelRays":
-        rays = Rays(self.rays.origins.to(device), self.rays.directions.to(device))
-        return PixelRays(rays, *(value.to(device) for value in self._values))
-
-    @property
-    def _values(self) -> tuple[Tensor, ...]:
-        return self.colours, self.is_object, self.view, self.pixels, self.is_inner
+    def _mapped(self, change: Callable[[Tensor], Tensor]) -> "PixelRays":
+        values = (self.colours, self.is_object, self.view, self.pixels, self.is_inner)
+        return PixelRays(Rays(change(self.rays.origins), change(self.rays.directions)), *map(change, values))
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,20 @@ class ConsistentDepths:
     @torch.no_grad()
     def of(maps: Sequence[DepthMap]) -> "ConsistentDepths":
         """The reliable depths that enough other views confirm."""
-        parts = [_confirmed(one, [other for other in maps if other is not one]) for one in maps]
+        parts = []
+        for one in maps:
+            rays = one.camera.rays()[one.reliable]
+            distance = (one.depth / one.camera.cosines())[one.reliable]
+            points = rays.at(distance)
+            bounds = meet_sphere(rays)
+            free, occupied = torch.zeros(2, len(points))
+            for other in maps:
+                if other is not one:
+                    votes_free, votes_occupied = other.votes(points)
+                    free += votes_free
+                    occupied += votes_occupied
+            kept = (occupied >= LEAST_CONFIRMATIONS) & (occupied > free) & (points.norm(dim=-1) < 1) & bounds.meets
+            parts.append((rays.origins[kept], rays.directions[kept], bounds.near[kept], distance[kept]))
         if not parts:
             return NO_DEPTHS
         origins, directions, near, distance = (torch.cat(part) for part in zip(*parts, strict=True))
@@ -146,18 +159,3 @@ def depth_loss(values: Float[Tensor, "four_times_count"]) -> Float[Tensor, ""]:
     on, before, close, behind = values.chunk(4)
     free = (TOLERANCE - before).relu() + (TOLERANCE - close).relu()
     return ((on.abs() - TOLERANCE).relu() + free + behind.relu()).mean()
-
-
-def _confirmed(one: DepthMap, others: Sequence[DepthMap]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Origins, directions, distances to the unit sphere and to the surface of a map's confirmed rays."""
-    rays = one.camera.rays()[one.reliable]
-    distance = (one.depth / one.camera.cosines())[one.reliable]
-    points = rays.at(distance)
-    bounds = meet_sphere(rays)
-    free, occupied = torch.zeros(2, len(points))
-    for other in others:
-        votes_free, votes_occupied = other.votes(points)
-        free += votes_free
-        occupied += votes_occupied
-    kept = (occupied >= LEAST_CONFIRMATIONS) & (occupied > free) & (points.norm(dim=-1) < 1) & bounds.meets
-    return rays.origins[kept], rays.directions[kept], bounds.near[kept], distance[kept]

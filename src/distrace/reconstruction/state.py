@@ -14,7 +14,7 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.errors import explained
 from distrace.files import written
-from distrace.reconstruction.surface_network import ColourNetwork, SurfaceNetwork, SurfaceSpecs
+from distrace.reconstruction.networks import ColourNetwork, SurfaceNetwork, SurfaceSpecs
 
 NAME = "checkpoint.pt"
 NUMBERS = ("step", "seconds", "evaluations", "loss_history")  # that a checkpoint holds as they are
