@@ -79,18 +79,18 @@ def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> Pl
     return PlacedShape(PRIOR.coordinates(last.code), last.place)
 
 
-def test_a_picture_has_its_pixels_at_their_centres_and_slopes_between() -> None:
+def test_a_gradient_image_interpolates_between_pixel_centres() -> None:
     camera = Camera.orbit(0, 0, 3, height=8, width=12)
     x, y = camera.pixels().unbind(-1)
-    picture = GradientImage.of(torch.stack([0.03 * x, 0.05 * y, 0.01 * x - 0.02 * y], dim=-1), camera)
+    image = GradientImage.of(torch.stack([0.03 * x, 0.05 * y, 0.01 * x - 0.02 * y], dim=-1), camera)
     at = torch.tensor([[3.5, 2.5], [4.75, 3.1], [9.2, 5.9]])
-    values, slopes = picture.at(at)
+    values, slopes = image.at(at)
     torch.testing.assert_close(values[:, 0], 0.03 * at[:, 0])
     torch.testing.assert_close(values[:, 1], 0.05 * at[:, 1])
     torch.testing.assert_close(slopes, torch.tensor([[0.03, 0.0], [0.0, 0.05], [0.01, -0.02]]).expand(3, 3, 2))
 
 
-def test_projected_points_move_as_finite_differences_say() -> None:
+def test_the_jacobian_of_a_projection_is_that_of_finite_differences() -> None:
     camera = Camera.orbit(40, 25, 3, height=30, width=40, focal_px=50.0, dtype=torch.float64)
     points = 0.3 * torch.randn(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     pixels, by_point = GradientImage(camera, torch.zeros(9, 30, 40)).project(points)
@@ -100,13 +100,13 @@ def test_projected_points_move_as_finite_differences_say() -> None:
         torch.testing.assert_close(by_point[..., axis].to(change), change, rtol=1e-5, atol=1e-6)
 
 
-def test_without_light_an_image_is_the_same_in_another_light() -> None:
+def test_a_normalised_image_hardly_depends_on_the_light() -> None:
     image = torch.rand(40, 50, 3, generator=torch.Generator().manual_seed(0))
     dimmed = 0.6 * image + 0.1
     assert (normalise_light(dimmed) - normalise_light(image)).abs().max() < 0.15 * (dimmed - image).abs().max()
 
 
-def test_partners_are_neighbours_on_a_ring_and_none_is_opposite() -> None:
+def test_neighbours_on_a_ring_are_near_and_none_is_opposite() -> None:
     chosen = neighbour_views(ring(18), 4)
     for view, others in enumerate(chosen.tolist()):
         steps = {min((view - other) % 18, (other - view) % 18) for other in others}
@@ -115,21 +115,22 @@ def test_partners_are_neighbours_on_a_ring_and_none_is_opposite() -> None:
     assert (neighbour_views(ring(3), 4) >= 0).sum(1).tolist() == [1, 1, 1], "too far apart, but there is no nearer one"
 
 
-def test_colours_seen_on_the_object_alone_are_its_own() -> None:
+def test_colours_of_the_object_alone_have_a_high_probability() -> None:
     random = torch.Generator().manual_seed(0)
     red, blue = (
         torch.tensor(c) + 0.05 * torch.randn(500, 3, generator=random) for c in ([0.8, 0.2, 0.2], [0.2, 0.3, 0.8])
     )
     both = F.pad(torch.cat([red, blue, blue, red[:50]]).clamp(0, 1), (0, 1))
     is_object = torch.cat([torch.ones(500), torch.zeros(500), torch.ones(60), torch.zeros(490)]).bool()[: len(both)]
-    regions = ColourModel.of(both, is_object)
-    asked = torch.tensor([[0.8, 0.2, 0.2, 0.0], [0.2, 0.3, 0.8, 0.0], [0.5, 0.9, 0.1, 0.0]])
-    assert regions.probability(asked[:1]) > 0.8
-    assert regions.probability(asked[2:]) == pytest.approx(0.5, abs=1e-3), "never seen"
+    model = ColourModel.of(both, is_object)
+    colours = torch.tensor([[0.8, 0.2, 0.2, 0.0], [0.2, 0.3, 0.8, 0.0], [0.5, 0.9, 0.1, 0.0]])
+    assert model.probability(colours[:1]) > 0.8
+    assert model.probability(colours[2:]) == pytest.approx(0.5, abs=1e-3), "a colour of neither"
 
 
-def test_an_object_as_grey_as_what_is_behind_it_is_told_by_its_grain() -> None:
-    image, random = torch.full((40, 40, 3), 0.5), torch.Generator().manual_seed(0)
+def test_roughness_separates_an_object_from_a_background_of_its_colour() -> None:
+    image = torch.full((40, 40, 3), 0.5)
+    random = torch.Generator().manual_seed(0)
     image[10:30, 10:30] += 0.06 * torch.randn(20, 20, 1, generator=random)
     thought = torch.zeros(40, 40, dtype=torch.bool)
     thought[8:26, 12:34] = True
@@ -138,9 +139,10 @@ def test_an_object_as_grey_as_what_is_behind_it_is_told_by_its_grain() -> None:
     assert found[13:27, 13:27].min() > 0.5 > found[:7].max()
 
 
-def test_a_leg_of_a_pixel_before_other_colours_is_neither_object_nor_background() -> None:
+def test_a_leg_one_pixel_wide_is_labelled_neither_object_nor_background() -> None:
     image = torch.tensor([0.2, 0.3, 0.8]).repeat(40, 40, 1)
-    image[:20], image[20:, 20] = torch.tensor([0.8, 0.2, 0.2]), torch.tensor([0.8, 0.2, 0.2])
+    image[:20] = torch.tensor([0.8, 0.2, 0.2])
+    image[20:, 20] = torch.tensor([0.8, 0.2, 0.2])
     looks = F.pad(image, (0, 1))
     found = ColourModel.of(looks.reshape(-1, 4), image[..., 0].reshape(-1) > 0.5).smooth_probability(looks)
     assert found[:16].min() > 0.9
@@ -148,9 +150,11 @@ def test_a_leg_of_a_pixel_before_other_colours_is_neither_object_nor_background(
     assert (found[25:, 20] == 0.5).all()
 
 
-def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Decoder, views: list[Photograph]) -> None:
-    level, still = PyramidLevel.of(views, 1.0, COMPARED), Similarity.identity()
-    small, away = replace(still, scale=torch.tensor(0.6)), replace(still, translation=torch.tensor([0, 0, 9.0]))
+def test_inconsistency_ranks_the_true_shape_first(decoder: Decoder, views: list[Photograph]) -> None:
+    level = PyramidLevel.of(views, 1.0, COMPARED)
+    still = Similarity.identity()
+    small = replace(still, scale=torch.tensor(0.6))
+    away = replace(still, translation=torch.tensor([0, 0, 9.0]))
     shapes = [PlacedShape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
     true, same, less, unseen = inconsistencies(level, decoder, PRIOR, shapes, COMPARED, 0)
     assert true == same
@@ -160,9 +164,10 @@ def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Deco
 
 
 @pytest.mark.parametrize("kind", ["colour", "outline"])
-def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[Photograph], kind: str) -> None:
+def test_the_jacobian_is_that_of_finite_differences(decoder: Decoder, views: list[Photograph], kind: str) -> None:
     compared = replace(COMPARED, fit_place=True, rays=600)
-    shape, random = PlacedShape(PRIOR.coordinates(TRUE) + 0.3, MOVED), torch.Generator().manual_seed(0)
+    shape = PlacedShape(PRIOR.coordinates(TRUE) + 0.3, MOVED)
+    random = torch.Generator().manual_seed(0)
     level = PyramidLevel.of(views, 1.0, compared)
     problem, state = level.problem(level.sample(decoder, PRIOR, shape, compared.rays, random), compared)
     before = problem.residuals(state)
@@ -182,7 +187,8 @@ def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[P
     else:
         change = ahead[0].values[:size] - behind[0].values[:size]
         expected = (before.jacobian @ (2 * step))[wanted]
-    change, expected = change[expected != 0], expected[expected != 0]
+    change = change[expected != 0]
+    expected = expected[expected != 0]
     off = (change - expected).abs()
     assert off.median() < 0.15 * expected.abs().median(), "bilinear colours and flat facets: not every single one"
 
@@ -192,11 +198,11 @@ def changed(problem: PhotoProblem, shape: PlacedShape, step: Tensor) -> tuple:
     return problem.residuals(state), state.wrong
 
 
-def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
+def test_a_code_is_fitted_to_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
-def test_a_code_and_a_place_are_found_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_code_and_a_placement_are_fitted_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
     places = []
     starts = Initialiser.starts
 
@@ -227,7 +233,7 @@ def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:
     torch.testing.assert_close(matrix[:3, :3] @ point + matrix[:3, 3], MOVED.to_world(point))
 
 
-def test_a_view_whose_camera_is_wrong_is_told(decoder: Decoder, views: list[Photograph]) -> None:
+def test_a_view_with_a_wrong_camera_is_an_outlier(decoder: Decoder, views: list[Photograph]) -> None:
     wrong = [replace(view, camera=view.camera.turned(15.0)) if k == 4 else view for k, view in enumerate(views)]
     shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
     assert [view.name for view in view_agreements(decoder, wrong, PRIOR, shape, COMPARED) if view.is_outlier] == ["04"]
@@ -242,7 +248,8 @@ def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) ->
 def test_all_evaluations_are_counted(
     decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, run = 0, Decoder._run
+    made = 0
+    run = Decoder._run
 
     def counting(self: Decoder, layers: list, points: Tensor, *watch: object) -> Tensor:
         nonlocal made
@@ -259,7 +266,9 @@ def test_all_evaluations_are_counted(
 
 
 def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder, views: list[Photograph]) -> None:
-    level, search, still = PyramidLevel.of(views, 0.5, COMPARED), Initialiser(decoder, PRIOR), Similarity.identity()
+    level = PyramidLevel.of(views, 0.5, COMPARED)
+    search = Initialiser(decoder, PRIOR)
+    still = Similarity.identity()
     for place in (replace(still, scale=torch.tensor(0.01)), replace(still, translation=torch.tensor([2.5, 0, 0]))):
         assert search.likelier(level, COMPARED, (place, still)) is still
 
@@ -267,7 +276,8 @@ def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder
 def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite(
     decoder: Decoder, views: list[Photograph]
 ) -> None:
-    shape, level = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity()), PyramidLevel.of(views, 0.5, COMPARED)
+    shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
+    level = PyramidLevel.of(views, 0.5, COMPARED)
     compared = replace(COMPARED, fit_place=True)
     sample = level.sample(decoder, PRIOR, shape, compared.rays, torch.Generator().manual_seed(0))
     problem, state = level.problem(sample, compared)
@@ -279,8 +289,8 @@ def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite
     assert found.jacobian.isfinite().all()
 
 
-def test_without_object_or_background_no_colour_tells() -> None:
+def test_without_object_or_background_every_probability_is_one_half() -> None:
     looks = appearance(torch.rand(20, 20, 3)).reshape(-1, 4)
     for is_object in (torch.zeros(400, dtype=torch.bool), torch.ones(400, dtype=torch.bool)):
-        told = ColourModel.of(looks, is_object).probability(looks)
-        torch.testing.assert_close(told, torch.full_like(told, 0.5))
+        probability = ColourModel.of(looks, is_object).probability(looks)
+        torch.testing.assert_close(probability, torch.full_like(probability, 0.5))

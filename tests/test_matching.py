@@ -23,7 +23,10 @@ def views() -> list[Photograph]:
 
 def rays_of(views: list[Photograph], every: int = 97) -> tuple[torch.Tensor, torch.Tensor, Rays]:
     """Views, pixels and rays of some of the ball's pixels."""
-    view, places, origins, directions = [], [], [], []
+    view = []
+    places = []
+    origins = []
+    directions = []
     for number, each in enumerate(views):
         some = each.camera.pixels()[each.known_mask & ~band(each.known_mask, PATCH_WIDTH)][::every]
         rays = each.camera.rays(some)
@@ -34,7 +37,7 @@ def rays_of(views: list[Photograph], every: int = 97) -> tuple[torch.Tensor, tor
     return torch.cat(view), torch.cat(places), Rays(torch.cat(origins), torch.cat(directions))
 
 
-def term(matching: PatchMatching, views: list[Photograph], radius: float) -> float:
+def patch_loss(matching: PatchMatching, views: list[Photograph], radius: float) -> float:
     view, places, rays = rays_of(views)
     trace = sphere_trace(sphere(radius), rays, meet_sphere(rays), EXACT)
     points = rays[trace.hit].at(trace.distance[trace.hit])
@@ -43,16 +46,16 @@ def term(matching: PatchMatching, views: list[Photograph], radius: float) -> flo
 
 def test_the_true_surface_agrees_best(views: list[Photograph]) -> None:
     matching = PatchMatching.of(views, torch.device("cpu"))
-    true = term(matching, views, 0.5)
+    true = patch_loss(matching, views, 0.5)
     assert true < 0.01
     for radius in (0.49, 0.495, 0.505, 0.51):
-        assert term(matching, views, radius) > 1.2 * true
+        assert patch_loss(matching, views, radius) > 1.2 * true
 
 
 def test_images_may_differ_in_size_and_light(views: list[Photograph]) -> None:
     small = views[3].resized(0.5)
     some = [*views[:3], replace(small, image=0.3 * small.image + 0.1), *views[4:]]
-    assert term(PatchMatching.of(some, torch.device("cpu")), some, 0.5) < 0.03
+    assert patch_loss(PatchMatching.of(some, torch.device("cpu")), some, 0.5) < 0.03
 
 
 def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
@@ -62,7 +65,9 @@ def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
     view, places, rays = rays_of(views, 61)
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
     trace = sphere_trace(sphere(0.49), rays, meet_sphere(rays), EXACT)
-    view, places, rays = view[trace.hit], places[trace.hit].double(), rays[trace.hit]
+    view = view[trace.hit]
+    places = places[trace.hit].double()
+    rays = rays[trace.hit]
     normals = F.normalize(rays.at(trace.distance[trace.hit]), dim=-1)
 
     def loss(distance: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
