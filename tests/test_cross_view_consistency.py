@@ -1,15 +1,15 @@
-"""What several views together allow: pixels beside a ball that look like it in one view only."""
+"""Cross-view consistency: pixels beside a ball that look like it in one view only."""
 
 import pytest
 import torch
 from photographed import ball
 from test_fit_photos import ring
 
-from distrace.photos.cross_view_consistency import Consensus
+from distrace.photos.visual_hull import CrossViewConsistency
 
 SIZE = 48
 CAMERAS = ring(size=SIZE)
-CONSENSUS = Consensus.of(CAMERAS)
+CONSISTENCY = CrossViewConsistency.of(CAMERAS)
 
 
 @pytest.fixture(scope="module")
@@ -17,22 +17,22 @@ def masks() -> list[torch.Tensor]:
     return [ball(camera, 0.4) for camera in CAMERAS]
 
 
-def test_what_only_one_view_has_is_ruled_out_and_the_object_is_kept(masks: list[torch.Tensor]) -> None:
+def test_pixels_that_one_view_alone_has_are_ruled_out_and_the_object_is_kept(masks: list[torch.Tensor]) -> None:
     likely = list(masks)
     likely[3] = likely[3].clone()
     likely[3][:8, :8] = True  # a neighbour of the same colour
-    shown = CONSENSUS.agreed(likely)
+    shown = CONSISTENCY.silhouettes(likely)
     assert not shown[3][:8, :8].any()
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
 
-def test_what_one_view_lacks_is_kept(masks: list[torch.Tensor]) -> None:
+def test_an_object_that_one_view_lacks_is_kept(masks: list[torch.Tensor]) -> None:
     likely = list(masks)
     likely[3] = torch.zeros_like(likely[3])
-    shown = CONSENSUS.agreed(likely)
+    shown = CONSISTENCY.silhouettes(likely)
     assert all((mask & ~possible).sum() == 0 for mask, possible in zip(masks, shown, strict=True))
 
 
-def test_without_anything_likely_nothing_is_possible() -> None:
-    shown = CONSENSUS.agreed([torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
+def test_empty_masks_have_empty_silhouettes() -> None:
+    shown = CONSISTENCY.silhouettes([torch.zeros(SIZE, SIZE).bool()] * len(CAMERAS))
     assert not torch.stack(shown).any()

@@ -14,14 +14,13 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.fields.decoder import Decoder
-from distrace.photos.colour_segmentation import Regions, appearance
+from distrace.photos.colour_segmentation import ColourModel, appearance
 from distrace.photos.fit_photos import PhotoConfig, fit_photos
-from distrace.photos.initialisation import Search
-from distrace.photos.model_selection import contradictions
-from distrace.photos.outlier_views import agreements
-from distrace.photos.residuals import PhotoProblem, Shape
-from distrace.photos.stage import Comparing, Stage
-from distrace.photos.stereo_pairs import Colours, partners, without_light
+from distrace.photos.initialisation import Initialiser
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PhotoProblem, PlacedShape
+from distrace.photos.selection import inconsistencies, view_agreements
+from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import meet_sphere
@@ -30,9 +29,9 @@ from distrace.render import render
 PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
 TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
 GREY = torch.tensor([0.4, 0.45, 0.5])
-COMPARED = Comparing(rays=1500, partners=3, moves=False)
-CONFIG = PhotoConfig(iterations=12, starts=1, levels=(0.5, 0.5, 1.0, 1.0), compared=COMPARED)
-MEAN = Shape(torch.zeros(4), Similarity.identity())
+COMPARED = ComparisonConfig(rays=1500, neighbours=3, fit_place=False)
+CONFIG = PhotoConfig(iterations=12, starts=1, levels=(0.5, 0.5, 1.0, 1.0), comparison=COMPARED)
+MEAN = PlacedShape(torch.zeros(4), Similarity.identity())
 MOVED = Similarity.identity().moved(torch.tensor([0.05, -0.08, 0.04, 0.03, -0.02, 0.03, 0.05]))
 
 
@@ -67,7 +66,7 @@ def views(decoder: Decoder) -> list[Photograph]:
 
 
 @torch.no_grad()
-def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> float:
+def error(decoder: Decoder, shape: PlacedShape, place: Similarity | None = None) -> float:
     """Root mean square, over the surface of the true shape in its place, of the field of another in its own."""
     points = torch.cat([render(decoder.field(TRUE), camera).points for camera in ring(6, 24)])
     world = (place or Similarity.identity()).to_world(points)
@@ -75,85 +74,89 @@ def error(decoder: Decoder, shape: Shape, place: Similarity | None = None) -> fl
     return float(decoder.field(PRIOR.code(shape.w))(there).square().mean().sqrt())
 
 
-def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> Shape:
+def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> PlacedShape:
     *_, last = fit_photos(decoder, views, PRIOR, config)
-    return Shape(PRIOR.coordinates(last.code), last.place)
+    return PlacedShape(PRIOR.coordinates(last.code), last.place)
 
 
-def test_a_picture_has_its_pixels_at_their_centres_and_slopes_between() -> None:
+def test_a_gradient_image_interpolates_between_pixel_centres() -> None:
     camera = Camera.orbit(0, 0, 3, height=8, width=12)
     x, y = camera.pixels().unbind(-1)
-    picture = Colours.of(torch.stack([0.03 * x, 0.05 * y, 0.01 * x - 0.02 * y], dim=-1), camera)
+    image = GradientImage.of(torch.stack([0.03 * x, 0.05 * y, 0.01 * x - 0.02 * y], dim=-1), camera)
     at = torch.tensor([[3.5, 2.5], [4.75, 3.1], [9.2, 5.9]])
-    values, slopes = picture.at(at)
+    values, slopes = image.at(at)
     torch.testing.assert_close(values[:, 0], 0.03 * at[:, 0])
     torch.testing.assert_close(values[:, 1], 0.05 * at[:, 1])
     torch.testing.assert_close(slopes, torch.tensor([[0.03, 0.0], [0.0, 0.05], [0.01, -0.02]]).expand(3, 3, 2))
 
 
-def test_projected_points_move_as_finite_differences_say() -> None:
+def test_the_jacobian_of_a_projection_is_that_of_finite_differences() -> None:
     camera = Camera.orbit(40, 25, 3, height=30, width=40, focal_px=50.0, dtype=torch.float64)
     points = 0.3 * torch.randn(5, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    pixels, by_point = Colours(camera, torch.zeros(9, 30, 40)).projected(points)
+    pixels, by_point = GradientImage(camera, torch.zeros(9, 30, 40)).project(points)
     torch.testing.assert_close(pixels, camera.project(points)[0])
     for axis, step in enumerate(1e-6 * torch.eye(3, dtype=torch.float64)):
         change = (camera.project(points + step)[0] - camera.project(points - step)[0]) / 2e-6
         torch.testing.assert_close(by_point[..., axis].to(change), change, rtol=1e-5, atol=1e-6)
 
 
-def test_without_light_an_image_is_the_same_in_another_light() -> None:
+def test_a_normalised_image_hardly_depends_on_the_light() -> None:
     image = torch.rand(40, 50, 3, generator=torch.Generator().manual_seed(0))
     dimmed = 0.6 * image + 0.1
-    assert (without_light(dimmed) - without_light(image)).abs().max() < 0.15 * (dimmed - image).abs().max()
+    assert (normalise_light(dimmed) - normalise_light(image)).abs().max() < 0.15 * (dimmed - image).abs().max()
 
 
-def test_partners_are_neighbours_on_a_ring_and_none_is_opposite() -> None:
-    chosen = partners(ring(18), 4)
+def test_neighbours_on_a_ring_are_near_and_none_is_opposite() -> None:
+    chosen = neighbour_views(ring(18), 4)
     for view, others in enumerate(chosen.tolist()):
         steps = {min((view - other) % 18, (other - view) % 18) for other in others}
         assert steps <= {1, 2, 3}
         assert view not in others
-    assert (partners(ring(3), 4) >= 0).sum(1).tolist() == [1, 1, 1], "too far apart, but there is no nearer one"
+    assert (neighbour_views(ring(3), 4) >= 0).sum(1).tolist() == [1, 1, 1], "too far apart, but there is no nearer one"
 
 
-def test_colours_seen_on_the_object_alone_are_its_own() -> None:
+def test_colours_of_the_object_alone_have_a_high_probability() -> None:
     random = torch.Generator().manual_seed(0)
     red, blue = (
         torch.tensor(c) + 0.05 * torch.randn(500, 3, generator=random) for c in ([0.8, 0.2, 0.2], [0.2, 0.3, 0.8])
     )
     both = F.pad(torch.cat([red, blue, blue, red[:50]]).clamp(0, 1), (0, 1))
     is_object = torch.cat([torch.ones(500), torch.zeros(500), torch.ones(60), torch.zeros(490)]).bool()[: len(both)]
-    regions = Regions.of(both, is_object)
-    asked = torch.tensor([[0.8, 0.2, 0.2, 0.0], [0.2, 0.3, 0.8, 0.0], [0.5, 0.9, 0.1, 0.0]])
-    assert regions.probability(asked[:1]) > 0.8
-    assert regions.probability(asked[2:]) == pytest.approx(0.5, abs=1e-3), "never seen"
+    model = ColourModel.of(both, is_object)
+    colours = torch.tensor([[0.8, 0.2, 0.2, 0.0], [0.2, 0.3, 0.8, 0.0], [0.5, 0.9, 0.1, 0.0]])
+    assert model.probability(colours[:1]) > 0.8
+    assert model.probability(colours[2:]) == pytest.approx(0.5, abs=1e-3), "a colour of neither"
 
 
-def test_an_object_as_grey_as_what_is_behind_it_is_told_by_its_grain() -> None:
-    image, random = torch.full((40, 40, 3), 0.5), torch.Generator().manual_seed(0)
+def test_roughness_separates_an_object_from_a_background_of_its_colour() -> None:
+    image = torch.full((40, 40, 3), 0.5)
+    random = torch.Generator().manual_seed(0)
     image[10:30, 10:30] += 0.06 * torch.randn(20, 20, 1, generator=random)
     thought = torch.zeros(40, 40, dtype=torch.bool)
     thought[8:26, 12:34] = True
     looks = appearance(image)
-    found = Regions.of(looks.reshape(-1, 4), thought.reshape(-1)).smooth_probability(looks)
+    found = ColourModel.of(looks.reshape(-1, 4), thought.reshape(-1)).smooth_probability(looks)
     assert found[13:27, 13:27].min() > 0.5 > found[:7].max()
 
 
-def test_a_leg_of_a_pixel_before_other_colours_is_neither_object_nor_background() -> None:
+def test_a_leg_one_pixel_wide_is_labelled_neither_object_nor_background() -> None:
     image = torch.tensor([0.2, 0.3, 0.8]).repeat(40, 40, 1)
-    image[:20], image[20:, 20] = torch.tensor([0.8, 0.2, 0.2]), torch.tensor([0.8, 0.2, 0.2])
+    image[:20] = torch.tensor([0.8, 0.2, 0.2])
+    image[20:, 20] = torch.tensor([0.8, 0.2, 0.2])
     looks = F.pad(image, (0, 1))
-    found = Regions.of(looks.reshape(-1, 4), image[..., 0].reshape(-1) > 0.5).smooth_probability(looks)
+    found = ColourModel.of(looks.reshape(-1, 4), image[..., 0].reshape(-1) > 0.5).smooth_probability(looks)
     assert found[:16].min() > 0.9
     assert found[25:, :17].max() < 0.1
     assert (found[25:, 20] == 0.5).all()
 
 
-def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Decoder, views: list[Photograph]) -> None:
-    stage, still = Stage.of(views, 1.0, COMPARED), Similarity.identity()
-    small, away = replace(still, scale=torch.tensor(0.6)), replace(still, translation=torch.tensor([0, 0, 9.0]))
-    shapes = [Shape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
-    true, same, less, unseen = contradictions(stage, decoder, PRIOR, shapes, COMPARED, 0)
+def test_inconsistency_ranks_the_true_shape_first(decoder: Decoder, views: list[Photograph]) -> None:
+    level = PyramidLevel.of(views, 1.0, COMPARED)
+    still = Similarity.identity()
+    small = replace(still, scale=torch.tensor(0.6))
+    away = replace(still, translation=torch.tensor([0, 0, 9.0]))
+    shapes = [PlacedShape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
+    true, same, less, unseen = inconsistencies(level, decoder, PRIOR, shapes, COMPARED, 0)
     assert true == same
     assert unseen[0] == inf
     assert less[0] > 1.2 * true[0]
@@ -161,56 +164,59 @@ def test_shapes_are_judged_by_what_all_of_them_take_for_the_object(decoder: Deco
 
 
 @pytest.mark.parametrize("kind", ["colour", "outline"])
-def test_residuals_change_as_their_jacobian_says(decoder: Decoder, views: list[Photograph], kind: str) -> None:
-    compared = replace(COMPARED, moves=True, rays=600)
-    shape, random = Shape(PRIOR.coordinates(TRUE) + 0.3, MOVED), torch.Generator().manual_seed(0)
-    stage = Stage.of(views, 1.0, compared)
-    problem, look = stage.problem(stage.glimpse(decoder, PRIOR, shape, compared.rays, random), compared)
-    before = problem.residuals(look)
+def test_the_jacobian_is_that_of_finite_differences(decoder: Decoder, views: list[Photograph], kind: str) -> None:
+    compared = replace(COMPARED, fit_place=True, rays=600)
+    shape = PlacedShape(PRIOR.coordinates(TRUE) + 0.3, MOVED)
+    random = torch.Generator().manual_seed(0)
+    level = PyramidLevel.of(views, 1.0, compared)
+    problem, state = level.problem(level.sample(decoder, PRIOR, shape, compared.rays, random), compared)
+    before = problem.residuals(state)
     size = 3 * len(problem.pairs)
     rows = torch.arange(len(before.values))
-    wanted = rows < size if kind == "colour" else (rows >= size) & (rows < size + int(look.wrong.sum()))
+    wanted = rows < size if kind == "colour" else (rows >= size) & (rows < size + int(state.wrong.sum()))
     assert wanted.sum() > 20
     direction = torch.randn(11, generator=random)
     step = 2e-3 * direction / direction.norm()
     ahead, behind = (changed(problem, shape, sign * step) for sign in (1, -1))
     if kind == "outline":
-        same = ahead[1] & behind[1] & look.wrong
-        pick = same[look.wrong]
+        same = ahead[1] & behind[1] & state.wrong
+        pick = same[state.wrong]
         change = ahead[0].values[size : size + int(ahead[1].sum())][same[ahead[1]]]
         change = change - behind[0].values[size : size + int(behind[1].sum())][same[behind[1]]]
         expected = (before.jacobian @ (2 * step))[wanted][pick]
     else:
         change = ahead[0].values[:size] - behind[0].values[:size]
         expected = (before.jacobian @ (2 * step))[wanted]
-    change, expected = change[expected != 0], expected[expected != 0]
+    change = change[expected != 0]
+    expected = expected[expected != 0]
     off = (change - expected).abs()
     assert off.median() < 0.15 * expected.abs().median(), "bilinear colours and flat facets: not every single one"
 
 
-def changed(problem: PhotoProblem, shape: Shape, step: Tensor) -> tuple:
-    look = problem.look(Shape(shape.w + step[:4], shape.place.moved(step[4:])))
-    return problem.residuals(look), look.wrong
+def changed(problem: PhotoProblem, shape: PlacedShape, step: Tensor) -> tuple:
+    state = problem.trace(PlacedShape(shape.w + step[:4], shape.place.moved(step[4:])))
+    return problem.residuals(state), state.wrong
 
 
-def test_a_code_is_found_from_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
+def test_a_code_is_fitted_to_photographs_alone(decoder: Decoder, views: list[Photograph]) -> None:
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
-def test_a_code_and_a_place_are_found_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked, starts = list[Similarity](), Search.starts
+def test_a_code_and_a_placement_are_fitted_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
+    places = []
+    starts = Initialiser.starts
 
-    def asking(search: Search, stage: Stage, compared: Comparing, place: Similarity, count: int) -> list[Tensor]:
-        asked.append(place)
-        return starts(search, stage, compared, place, count)
+    def recording(initialiser: Initialiser, level: PyramidLevel, *given: object) -> list[Tensor]:
+        places.append(given[1])
+        return starts(initialiser, level, *given)
 
-    monkeypatch.setattr(Search, "starts", asking)
-    config = replace(CONFIG, iterations=20, approach=8, compared=replace(COMPARED, moves=True))
+    monkeypatch.setattr(Initialiser, "starts", recording)
+    config = replace(CONFIG, iterations=20, place_iterations=8, comparison=replace(COMPARED, fit_place=True))
     steps = list(fit_photos(decoder, photographs(decoder, ring(), MOVED), PRIOR, config))
-    assert [step.name for step in steps] == ["approach"] * 8 + ["start 1"] * 20
+    assert [step.name for step in steps] == ["placement"] * 8 + ["start 1"] * 20
     assert len(steps) == config.total
-    assert [id(place) for place in asked] == [id(steps[7].place)], "starts begin where the mean shape has come to"
-    found = Shape(PRIOR.coordinates(steps[-1].code), steps[-1].place)  # of three seeds: 0.143 to 0.156 of the start
+    assert [id(place) for place in places] == [id(steps[7].place)], "starts begin where the mean shape has come to"
+    found = PlacedShape(PRIOR.coordinates(steps[-1].code), steps[-1].place)  # 0.143 to 0.156 by seed
     assert error(decoder, found, MOVED) < 0.17 * error(decoder, MEAN, MOVED)
 
 
@@ -227,11 +233,11 @@ def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:
     torch.testing.assert_close(matrix[:3, :3] @ point + matrix[:3, 3], MOVED.to_world(point))
 
 
-def test_a_view_whose_camera_is_wrong_is_told(decoder: Decoder, views: list[Photograph]) -> None:
+def test_a_view_with_a_wrong_camera_is_an_outlier(decoder: Decoder, views: list[Photograph]) -> None:
     wrong = [replace(view, camera=view.camera.turned(15.0)) if k == 4 else view for k, view in enumerate(views)]
-    shape = Shape(PRIOR.coordinates(TRUE), Similarity.identity())
-    assert [view.name for view in agreements(decoder, wrong, PRIOR, shape, COMPARED) if view.doubtful] == ["04"]
-    assert not any(view.doubtful for view in agreements(decoder, views, PRIOR, shape, COMPARED))
+    shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
+    assert [view.name for view in view_agreements(decoder, wrong, PRIOR, shape, COMPARED) if view.is_outlier] == ["04"]
+    assert not any(view.is_outlier for view in view_agreements(decoder, views, PRIOR, shape, COMPARED))
 
 
 def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) -> None:
@@ -242,7 +248,8 @@ def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) ->
 def test_all_evaluations_are_counted(
     decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    made, run = 0, Decoder._run
+    made = 0
+    run = Decoder._run
 
     def counting(self: Decoder, layers: list, points: Tensor, *watch: object) -> Tensor:
         nonlocal made
@@ -250,37 +257,40 @@ def test_all_evaluations_are_counted(
         return run(self, layers, points, *watch)
 
     monkeypatch.setattr(Decoder, "_run", counting)
-    compared = replace(COMPARED, rays=300, moves=True)
+    compared = replace(COMPARED, rays=300, fit_place=True)
     first, *others = fit_photos(
-        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, approach=2, compared=compared)
+        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, place_iterations=2, comparison=compared)
     )
     assert first.evaluations + sum(step.evaluations for step in others) == pytest.approx(made, rel=0.01)
     assert 0 < first.searched < first.evaluations
 
 
 def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder, views: list[Photograph]) -> None:
-    stage, search, still = Stage.of(views, 0.5, COMPARED), Search(decoder, PRIOR), Similarity.identity()
+    level = PyramidLevel.of(views, 0.5, COMPARED)
+    search = Initialiser(decoder, PRIOR)
+    still = Similarity.identity()
     for place in (replace(still, scale=torch.tensor(0.01)), replace(still, translation=torch.tensor([2.5, 0, 0]))):
-        assert search.likelier(stage, COMPARED, (place, still)) is still
+        assert search.likelier(level, COMPARED, (place, still)) is still
 
 
 def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite(
     decoder: Decoder, views: list[Photograph]
 ) -> None:
-    shape, stage = Shape(PRIOR.coordinates(TRUE), Similarity.identity()), Stage.of(views, 0.5, COMPARED)
-    compared = replace(COMPARED, moves=True)
-    glimpse = stage.glimpse(decoder, PRIOR, shape, compared.rays, torch.Generator().manual_seed(0))
-    problem, look = stage.problem(glimpse, compared)
-    away = problem.moved(look, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
-    rays = shape.place.rays_in_object(problem.seen.rays[problem.pairs[:, 0]])
+    shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
+    level = PyramidLevel.of(views, 0.5, COMPARED)
+    compared = replace(COMPARED, fit_place=True)
+    sample = level.sample(decoder, PRIOR, shape, compared.rays, torch.Generator().manual_seed(0))
+    problem, state = level.problem(sample, compared)
+    away = problem.retract(state, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
+    rays = shape.place.rays_in_object(problem.observations.rays[problem.pairs[:, 0]])
     assert not meet_sphere(away.shape.place.rays_in_object(rays)).meets.all(), "some leave it"
     found = problem.residuals(away)
     assert found.values.isfinite().all()
     assert found.jacobian.isfinite().all()
 
 
-def test_without_object_or_background_no_colour_tells() -> None:
+def test_without_object_or_background_every_probability_is_one_half() -> None:
     looks = appearance(torch.rand(20, 20, 3)).reshape(-1, 4)
     for is_object in (torch.zeros(400, dtype=torch.bool), torch.ones(400, dtype=torch.bool)):
-        told = Regions.of(looks, is_object).probability(looks)
-        torch.testing.assert_close(told, torch.full_like(told, 0.5))
+        probability = ColourModel.of(looks, is_object).probability(looks)
+        torch.testing.assert_close(probability, torch.full_like(probability, 0.5))

@@ -12,7 +12,7 @@ from distrace.data.photograph import Photograph
 from distrace.fields.primitives import sphere
 from distrace.fitting.ray_sampling import band
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruction.matching import ACROSS, Matching, correlation
+from distrace.reconstruction.matching import PATCH_WIDTH, PatchMatching, correlation
 from distrace.tracing.sphere_tracing import sphere_trace
 
 
@@ -23,9 +23,12 @@ def views() -> list[Photograph]:
 
 def rays_of(views: list[Photograph], every: int = 97) -> tuple[torch.Tensor, torch.Tensor, Rays]:
     """Views, pixels and rays of some of the ball's pixels."""
-    view, places, origins, directions = [], [], [], []
+    view = []
+    places = []
+    origins = []
+    directions = []
     for number, each in enumerate(views):
-        some = each.camera.pixels()[each.known_mask & ~band(each.known_mask, ACROSS)][::every]
+        some = each.camera.pixels()[each.known_mask & ~band(each.known_mask, PATCH_WIDTH)][::every]
         rays = each.camera.rays(some)
         view.append(torch.full((len(some),), number))
         places.append(some)
@@ -34,39 +37,41 @@ def rays_of(views: list[Photograph], every: int = 97) -> tuple[torch.Tensor, tor
     return torch.cat(view), torch.cat(places), Rays(torch.cat(origins), torch.cat(directions))
 
 
-def term(matching: Matching, views: list[Photograph], radius: float) -> float:
+def patch_loss(matching: PatchMatching, views: list[Photograph], radius: float) -> float:
     view, places, rays = rays_of(views)
     trace = sphere_trace(sphere(radius), rays, meet_sphere(rays), EXACT)
     points = rays[trace.hit].at(trace.distance[trace.hit])
-    return float(matching.term(sphere(radius), view[trace.hit], places[trace.hit], points, F.normalize(points, dim=-1)))
+    return float(matching.loss(sphere(radius), view[trace.hit], places[trace.hit], points, F.normalize(points, dim=-1)))
 
 
 def test_the_true_surface_agrees_best(views: list[Photograph]) -> None:
-    matching = Matching.of(views, torch.device("cpu"))
-    true = term(matching, views, 0.5)
+    matching = PatchMatching.of(views, torch.device("cpu"))
+    true = patch_loss(matching, views, 0.5)
     assert true < 0.01
     for radius in (0.49, 0.495, 0.505, 0.51):
-        assert term(matching, views, radius) > 1.2 * true
+        assert patch_loss(matching, views, radius) > 1.2 * true
 
 
 def test_images_may_differ_in_size_and_light(views: list[Photograph]) -> None:
     small = views[3].resized(0.5)
     some = [*views[:3], replace(small, image=0.3 * small.image + 0.1), *views[4:]]
-    assert term(Matching.of(some, torch.device("cpu")), some, 0.5) < 0.03
+    assert patch_loss(PatchMatching.of(some, torch.device("cpu")), some, 0.5) < 0.03
 
 
 def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
     views = striped_ball(ring(16, 40))
-    matching = Matching.of(views, torch.device("cpu"))
-    doubled = Matching(*(x.double() if x.is_floating_point() else x for x in vars(matching).values()))
+    matching = PatchMatching.of(views, torch.device("cpu"))
+    doubled = PatchMatching(*(x.double() if x.is_floating_point() else x for x in vars(matching).values()))
     view, places, rays = rays_of(views, 61)
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
     trace = sphere_trace(sphere(0.49), rays, meet_sphere(rays), EXACT)
-    view, places, rays = view[trace.hit], places[trace.hit].double(), rays[trace.hit]
+    view = view[trace.hit]
+    places = places[trace.hit].double()
+    rays = rays[trace.hit]
     normals = F.normalize(rays.at(trace.distance[trace.hit]), dim=-1)
 
     def loss(distance: torch.Tensor, turned: torch.Tensor) -> torch.Tensor:
-        return doubled.term(
+        return doubled.loss(
             lambda points: 0 * points[..., 0], view, places, rays.at(distance), F.normalize(normals + turned, dim=-1)
         )
 
@@ -82,10 +87,10 @@ def test_the_derivative_by_the_points_is_that_of_finite_differences() -> None:
 
 
 def test_what_faces_away_is_not_compared(views: list[Photograph]) -> None:
-    matching = Matching.of(views, torch.device("cpu"))
+    matching = PatchMatching.of(views, torch.device("cpu"))
     view, places, rays = rays_of(views)
     points = rays.at(torch.full_like(rays.origins[:, 0], 2.0))
-    assert float(matching.term(sphere(0.5), view, places, points, rays.directions)) == 0.0
+    assert float(matching.loss(sphere(0.5), view, places, points, rays.directions)) == 0.0
 
 
 def test_correlation_knows_neither_brightness_nor_contrast() -> None:

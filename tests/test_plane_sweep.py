@@ -1,4 +1,4 @@
-"""Depths by planes swept through the unit sphere, what views agree on of them, and hollows that no outline shows."""
+"""Depths by a plane sweep, their consistency between views, and hollows that no outline shows."""
 
 from dataclasses import replace
 
@@ -11,13 +11,18 @@ from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.fields.base import SDF
 from distrace.fields.primitives import difference, sphere
-from distrace.photos.multiview_depth import NO_DEPTHS, AgreedDepths, contradicted
-from distrace.photos.plane_sweep import OFF, Depths, swept
 from distrace.photos.visual_hull import visual_hull
-from distrace.reconstruction import initialisation as beginning
-from distrace.reconstruction.initialisation import begin, telling
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
-from distrace.reconstruction.surface_network import SurfaceSpecs
+from distrace.reconstruction.multiview_depth import (
+    DEPTH_ERROR,
+    NO_DEPTHS,
+    ConsistentDepths,
+    DepthMap,
+    depth_loss,
+    plane_sweep,
+)
+from distrace.reconstruction.networks import SurfaceSpecs
+from distrace.reconstruction.reconstruct import informative_depths, initialise
+from distrace.reconstruction.state import ReconstructConfig, Reconstruction
 from distrace.render import render
 
 BOWL = difference(sphere(0.8), sphere(0.55, torch.tensor([0.0, 0.0, 0.6])))  # hollow to z = 0.05
@@ -48,70 +53,73 @@ def bowl() -> list[Photograph]:
 
 
 @pytest.fixture(scope="module")
-def told(bowl: list[Photograph]) -> list[Depths]:
-    return swept(bowl)
+def maps(bowl: list[Photograph]) -> list[DepthMap]:
+    return plane_sweep(bowl)
 
 
 @pytest.fixture(scope="module")
-def depths(told: list[Depths]) -> AgreedDepths:
-    return AgreedDepths.of(told)
+def depths(maps: list[DepthMap]) -> ConsistentDepths:
+    return ConsistentDepths.of(maps)
 
 
-def test_depths_that_are_sure_are_right(bowl: list[Photograph], told: list[Depths]) -> None:
-    for found, view in zip(told, bowl, strict=True):
-        assert found.sure.sum() > 0.3 * view.known_mask.sum()
-        assert not found.sure[~view.known_mask].any()
-        off = BOWL(view.camera.rays().at(found.depth / view.camera.cosines())[found.sure]).abs()
+def test_reliable_depths_are_right(bowl: list[Photograph], maps: list[DepthMap]) -> None:
+    for found, view in zip(maps, bowl, strict=True):
+        assert found.reliable.sum() > 0.3 * view.known_mask.sum()
+        assert not found.reliable[~view.known_mask].any()
+        off = BOWL(view.camera.rays().at(found.depth / view.camera.cosines())[found.reliable]).abs()
         assert off.median() < 0.015
-        assert (off < OFF).float().mean() > 0.8  # of the rest windows reach across an edge
+        assert (off < DEPTH_ERROR).float().mean() > 0.8  # of the rest windows reach across an edge
 
 
-def test_depths_that_views_agree_on_are_those_of_the_surface(told: list[Depths], depths: AgreedDepths) -> None:
-    sure = sum(int(each.sure.sum()) for each in told)
+def test_consistent_depths_lie_on_the_surface(maps: list[DepthMap], depths: ConsistentDepths) -> None:
+    sure = sum(int(each.reliable.sum()) for each in maps)
     assert 0.5 * sure < len(depths) < sure
-    assert BOWL(depths.rays.at(depths.distance)).abs().quantile(0.9) < OFF
+    assert BOWL(depths.rays.at(depths.distance)).abs().quantile(0.9) < DEPTH_ERROR
     assert (depths.rays.at(depths.near).norm(dim=-1) - 1).abs().max() < 1e-5
-    shifted = replace(told[0], depth=told[0].depth + 0.2)
-    assert len(AgreedDepths.of([shifted, *told[1:]])) < 0.95 * len(depths), "what others do not see is not believed"
+    shifted = replace(maps[0], depth=maps[0].depth + 0.2)
+    assert len(ConsistentDepths.of([shifted, *maps[1:]])) < 0.95 * len(depths), "inconsistent depths are dropped"
 
 
-def test_depths_contradict_what_fills_a_hollow_and_what_lacks(depths: AgreedDepths) -> None:
-    points = depths.drawn(2000, torch.Generator().manual_seed(0))
-    true = contradicted(BOWL(points))
-    assert contradicted(sphere(0.8)(points)) > 3 * true
-    assert contradicted(BOWL(points) + 0.1) > 3 * true
+def test_the_depth_loss_is_higher_where_a_hollow_is_filled_or_a_part_is_missing(depths: ConsistentDepths) -> None:
+    points = depths.sample(2000, torch.Generator().manual_seed(0))
+    true = depth_loss(BOWL(points))
+    assert depth_loss(sphere(0.8)(points)) > 3 * true
+    assert depth_loss(BOWL(points) + 0.1) > 3 * true
 
 
-def test_a_network_begins_with_a_hollow_that_no_outline_shows(bowl: list[Photograph], depths: AgreedDepths) -> None:
-    specs, hollow = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4), torch.tensor([[0.0, 0.0, 0.5]])
-    config, hull, found = ReconstructConfig(beginning=450, rays=256, learning_rate=5e-3), visual_hull(bowl), []
+def test_initialisation_finds_a_hollow_that_no_outline_shows(bowl: list[Photograph], depths: ConsistentDepths) -> None:
+    specs = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4)
+    hollow = torch.tensor([[0.0, 0.0, 0.5]])
+    config = ReconstructConfig(initial_steps=450, rays=256, learning_rate=5e-3)
+    hull = visual_hull(bowl)
+    found = []
     for some in (NO_DEPTHS, depths):
         state = Reconstruction.fresh(specs, config, len(bowl), torch.device("cpu"))
-        begin(state, hull, config, some)
-        assert (state.surface(torch.tensor([[0.0, 0.0, -0.4], [0.65, 0.0, 0.1]])) < 0).all(), "what is there stays"
+        initialise(state, hull, config, some)
+        assert (state.surface(torch.tensor([[0.0, 0.0, -0.4], [0.65, 0.0, 0.1]])) < 0).all(), "the solid stays"
         found.append(state.surface(hollow).item())
     filled, open_ = found
     assert filled < -0.05
     assert open_ > 0.05
 
 
-def test_depths_are_used_where_outlines_do_not_tell_the_shape(
-    bowl: list[Photograph], depths: AgreedDepths, told: list[Depths], monkeypatch: pytest.MonkeyPatch
+def test_depths_are_used_only_where_they_lie_deep_within_the_hull(
+    bowl: list[Photograph], depths: ConsistentDepths, maps: list[DepthMap], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(beginning, "swept", lambda _: told)
-    assert len(telling(bowl, visual_hull(bowl))) == len(depths)
-    assert telling(bowl, BOWL) is NO_DEPTHS
-    monkeypatch.setattr(beginning, "swept", lambda _: [])
-    assert telling(bowl, sphere(0.8)) is NO_DEPTHS
+    monkeypatch.setattr("distrace.reconstruction.reconstruct.plane_sweep", lambda _: maps)
+    assert len(informative_depths(bowl, visual_hull(bowl))) == len(depths)
+    assert informative_depths(bowl, BOWL) is NO_DEPTHS
+    monkeypatch.setattr("distrace.reconstruction.reconstruct.plane_sweep", lambda _: [])
+    assert informative_depths(bowl, sphere(0.8)) is NO_DEPTHS
 
 
-def test_lengths_of_gradients_count_more_with_depths() -> None:
-    config = ReconstructConfig(eikonal=0.5, firmness=4.0, colour=3.0)
+def test_the_eikonal_term_weighs_more_with_depths() -> None:
+    config = ReconstructConfig(eikonal=0.5, eikonal_with_depths=4.0, colour=3.0)
     assert [config.weight("eikonal", some) for some in (False, True)] == [0.5, 2.0]
     assert [config.weight("colour", some) for some in (False, True)] == [3.0, 3.0]
 
 
-def test_there_are_no_depths_where_nothing_tells_them(bowl: list[Photograph]) -> None:
+def test_without_texture_or_neighbour_there_are_no_depths(bowl: list[Photograph]) -> None:
     plain = [replace(view, image=torch.full_like(view.image, 0.5)) for view in bowl[:3]]
-    assert len(AgreedDepths.of(swept(plain))) == 0
-    assert len(AgreedDepths.of(swept(bowl[:1]))) == 0, "one view has no other to be compared with"
+    assert len(ConsistentDepths.of(plane_sweep(plain))) == 0
+    assert len(ConsistentDepths.of(plane_sweep(bowl[:1]))) == 0, "one view has no other to be compared with"

@@ -27,24 +27,30 @@ from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fields.primitives import box, sphere, torus
-from distrace.photos.multiview_depth import NO_DEPTHS
-from distrace.photos.visual_hull import overlaps, visual_hull
+from distrace.photos.visual_hull import mask_overlaps, visual_hull
 from distrace.rays import Rays, meet_sphere
-from distrace.reconstruction.camera_refinement import between, drift, motions, moved, relative
-from distrace.reconstruction.hash_grid import GridSpecs, HashGrid
-from distrace.reconstruction.initialisation import begin
-from distrace.reconstruction.matching import Matching
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
-from distrace.reconstruction.registration import registered
-from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
-from distrace.reconstruction.surface_network import (
+from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
+from distrace.reconstruction.losses import MARCH, PixelSampler, loss_terms, surface_colours
+from distrace.reconstruction.matching import PatchMatching
+from distrace.reconstruction.multiview_depth import NO_DEPTHS
+from distrace.reconstruction.networks import (
     ColourNetwork,
     CountedSurface,
+    GridSpecs,
+    HashGrid,
     SurfaceNetwork,
     SurfaceSpecs,
     squareplus,
 )
-from distrace.reconstruction.terms import MARCH, Pool, coloured, terms_of
+from distrace.reconstruction.reconstruct import initialise, reconstruct
+from distrace.reconstruction.state import (
+    ReconstructConfig,
+    Reconstruction,
+    fingerprint,
+    load_reconstruction,
+    rigid_motions,
+    save_reconstruction,
+)
 from distrace.render import render
 from distrace.report.reconstruction_page import judged
 from distrace.surface import attach
@@ -55,7 +61,7 @@ CPU = torch.device("cpu")
 SMALL = SurfaceSpecs(
     width=32, layers=2, frequencies=3, features=4, grid=GridSpecs(levels=3, finest=32, entries=512), colour_width=32
 )
-SHORT = ReconstructConfig(steps=150, beginning=200, sizes=(32,), rays=256, learning_rate=5e-3, retouching=30)
+SHORT = ReconstructConfig(steps=150, initial_steps=200, sizes=(32,), rays=256, learning_rate=5e-3, refinement_steps=30)
 
 
 Command = Callable[..., None]
@@ -75,7 +81,8 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Iterator[Command]:
 
 @pytest.fixture(scope="module")
 def views() -> list[Photograph]:
-    field, made = bumpy_balls(0.35).field(TRUE), []
+    field = bumpy_balls(0.35).field(TRUE)
+    made = []
     for number, camera in enumerate(ring(8, 40)):
         with torch.no_grad():
             buffers = render(field, camera)
@@ -90,7 +97,7 @@ def fitted(views: list[Photograph]) -> Reconstruction:
     return state
 
 
-def test_a_surface_begins_as_a_ball() -> None:
+def test_a_surface_network_starts_as_a_ball() -> None:
     torch.manual_seed(0)
     surface = SurfaceNetwork(SurfaceSpecs(radius=0.5))
     directions = F.normalize(torch.randn(200, 3), dim=-1)
@@ -101,7 +108,9 @@ def test_a_surface_begins_as_a_ball() -> None:
 
 def test_light_depends_on_normal_direction_and_place_alone() -> None:
     torch.manual_seed(0)
-    colour, points, features = ColourNetwork(SMALL), torch.randn(2, 3), torch.randn(2, SMALL.features)
+    colour = ColourNetwork(SMALL)
+    points = torch.randn(2, 3)
+    features = torch.randn(2, SMALL.features)
     normals, directions = F.normalize(torch.randn(2, 2, 3), dim=-1)
 
     def seen(n: torch.Tensor, v: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
@@ -110,7 +119,8 @@ def test_light_depends_on_normal_direction_and_place_alone() -> None:
     def lit(place: torch.Tensor) -> torch.Tensor:
         return seen(normals[0], directions[0], place) - seen(normals[1], directions[1], place)
 
-    here, there = lit(points[0]), lit(points[1])
+    here = lit(points[0])
+    there = lit(points[1])
     assert torch.allclose(here[0], here[1], atol=1e-5), "features took part"
     assert not torch.allclose(here, torch.zeros_like(here), atol=1e-3)
     assert not torch.allclose(here, there, atol=1e-3)
@@ -123,19 +133,20 @@ def test_squareplus_is_smooth_and_close_to_relu() -> None:
     assert torch.autograd.gradgradcheck(squareplus, x)
 
 
-def test_a_fit_shows_a_view_that_it_was_not_told(views: list[Photograph], fitted: Reconstruction) -> None:
+def test_a_fit_renders_a_held_out_view(views: list[Photograph], fitted: Reconstruction) -> None:
     before = judged(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
     after = judged(fitted, views[0], 40)
     assert after.silhouette_iou > max(0.9, before.silhouette_iou)
     assert after.psnr > before.psnr + 3
     assert fitted.evaluations > SHORT.steps * SHORT.rays
-    first, last = fitted.course["colour"]
+    first, last = fitted.loss_history["colour"]
     assert last < first
 
 
 def test_a_grid_is_linear_between_its_corners_and_even_beyond_the_cube() -> None:
     grid = HashGrid(GridSpecs(levels=2, coarsest=4, finest=8, entries=1000)).double()
-    a, b = torch.tensor([0.3, -0.2, 0.9]), torch.tensor([0.45, -0.2, 0.9])  # in one cell of both levels
+    a = torch.tensor([0.3, -0.2, 0.9])  # in one cell of both levels
+    b = torch.tensor([0.45, -0.2, 0.9])
     ends = grid(torch.stack([a, b, (a + b) / 2]).double())
     assert torch.allclose(ends[2], ends[:2].mean(0))
     assert torch.equal(grid(torch.tensor([[2.0, 0.1, -3.0]])), grid(torch.tensor([[1.0, 0.1, -1.0]])))
@@ -152,9 +163,10 @@ def test_each_corner_has_its_entry_and_fine_grids_share_theirs() -> None:
         GridSpecs(levels=0)
 
 
-def test_retouching_moves_colours_alone(views: list[Photograph], fitted: Reconstruction) -> None:
-    config = replace(SHORT, retouching=60)
-    state, told = deepcopy(fitted), views[1:]
+def test_colour_refinement_changes_colours_alone(views: list[Photograph], fitted: Reconstruction) -> None:
+    config = replace(SHORT, refinement_steps=60)
+    state = deepcopy(fitted)
+    told = views[1:]
     before = judged(state, told[0], 40)
     list(reconstruct(told, state, config))
     assert state.step == config.total == fitted.step + 30
@@ -163,26 +175,29 @@ def test_retouching_moves_colours_alone(views: list[Photograph], fitted: Reconst
     assert after.silhouette_iou == before.silhouette_iou
     for one, other in zip(state.surface.parameters(), fitted.surface.parameters(), strict=True):
         assert torch.equal(one, other)
-    assert torch.equal(state.steps_of_views, fitted.steps_of_views)
+    assert torch.equal(state.camera_steps, fitted.camera_steps)
 
 
-def test_without_a_surface_nothing_is_retouched(views: list[Photograph], fitted: Reconstruction) -> None:
+def test_without_a_surface_there_is_no_colour_refinement(views: list[Photograph], fitted: Reconstruction) -> None:
     state = deepcopy(fitted)
     with torch.no_grad():
         state.surface.last.bias[0] += 5.0
-    assert list(reconstruct(views[1:], state, replace(SHORT, retouching=60))) == []
+    assert list(reconstruct(views[1:], state, replace(SHORT, refinement_steps=60))) == []
 
 
 def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]) -> None:
     steps = torch.tensor([[0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.5], [0.0] * 6])
-    turned, still = motions(steps)
+    turned, still = rigid_motions(steps)
     assert torch.allclose(turned @ torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([0.0, 1.0, 0.5, 1.0]), atol=1e-6)
     assert torch.equal(still, torch.eye(4))
-    assert drift(views[0], moved(views[0], still)) == 0.0
-    assert torch.allclose(relative(steps).mean(0), torch.zeros(6), atol=1e-7)
+    assert pixel_shift(views[0], moved(views[0], still)) == 0.0
+    state = Reconstruction.fresh(SMALL, SHORT, 2, CPU)
+    state.camera_steps = steps[:1].expand(2, 6)
+    assert torch.equal(state.motions(), torch.eye(4).expand(2, 4, 4)), "all cameras moved alike would move the object"
     nudge = torch.tensor([[0.0, 0.0, 0.0, 0.03, 0.0, 0.0]])
-    pool, there = Pool.of(views[:1]).pixels, Pool.of([moved(views[0], motions(nudge)[0])]).pixels
-    again = pool.moved(motions(nudge))
+    pool = PixelSampler.of(views[:1]).pixels
+    there = PixelSampler.of([moved(views[0], rigid_motions(nudge)[0])]).pixels
+    again = pool.moved(rigid_motions(nudge))
     assert torch.allclose(again.rays.origins[0], there.rays.origins[0], atol=1e-6)
     assert torch.allclose(again.rays.directions.mean(0), there.rays.directions.mean(0), atol=1e-2)
 
@@ -191,34 +206,42 @@ def test_a_camera_between_two_moves_as_they_do() -> None:
     eyes = 3 * F.normalize(torch.tensor([[1.0, 0, 0], [1.0, 0, 1.0], [-1.0, 0, 0]]), dim=-1)
     steps = torch.arange(18.0).reshape(3, 6)
     halfway = F.normalize(F.normalize(eyes[:2], dim=-1).sum(0), dim=0)
-    torch.testing.assert_close(between(steps, eyes, halfway), steps[:2].mean(0))
-    torch.testing.assert_close(between(steps, eyes, 2 * eyes[2]), steps[2], atol=1e-3, rtol=0)
-    torch.testing.assert_close(between(steps[:1], eyes[:1], eyes[2]), steps[0])
+    torch.testing.assert_close(interpolated_step(steps, eyes, halfway), steps[:2].mean(0))
+    torch.testing.assert_close(interpolated_step(steps, eyes, 2 * eyes[2]), steps[2], atol=1e-3, rtol=0)
+    torch.testing.assert_close(interpolated_step(steps[:1], eyes[:1], eyes[2]), steps[0])
 
 
-def test_a_disturbed_camera_is_found_again(views: list[Photograph], fitted: Reconstruction) -> None:
-    off = moved(views[0], motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
+def test_a_disturbed_camera_is_registered(views: list[Photograph], fitted: Reconstruction) -> None:
+    off = moved(views[0], rigid_motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
     found = registered(fitted, off, SHORT)
-    assert drift(views[0], found) < drift(views[0], off) / 2, (drift(views[0], found), drift(views[0], off))
+    assert pixel_shift(views[0], found) < pixel_shift(views[0], off) / 2, (
+        pixel_shift(views[0], found),
+        pixel_shift(views[0], off),
+    )
     assert all(parameter.requires_grad for parameter in fitted.surface.parameters())
 
 
 def test_colours_pull_at_the_shape_exactly(views: list[Photograph], fitted: Reconstruction) -> None:
-    """The derivatives of colours by the surface's last bias agree with those of rays traced anew."""
-    surface, colour = deepcopy(fitted.surface).double(), deepcopy(fitted.colour).double()
-    rays, bias = Pool.of(views[1:3]).pixels.rays, surface.last.bias
+    """The derivatives of colours with respect to the surface's last bias are those of finite differences."""
+    surface = deepcopy(fitted.surface).double()
+    colour = deepcopy(fitted.colour).double()
+    rays = PixelSampler.of(views[1:3]).pixels.rays
+    bias = surface.last.bias
     rays = Rays(rays.origins.double(), F.normalize(rays.directions.double(), dim=-1))
     march = replace(MARCH, tolerance=1e-13, steps=400, step_scale=0.8)
     trace = sphere_trace(surface, rays, meet_sphere(rays), march)
-    rays, distance = rays[trace.hit], trace.distance[trace.hit]
-    red = coloured(surface, colour, rays.at(attach(surface, rays, distance)), rays.directions)[::29, 0]
+    rays = rays[trace.hit]
+    distance = trace.distance[trace.hit]
+    red = surface_colours(surface, colour, rays.at(attach(surface, rays, distance)), rays.directions)[::29, 0]
     exact = torch.stack([torch.autograd.grad(each, bias, retain_graph=True)[0][0] for each in red])
-    few, step, found = Rays(rays.origins[::29], rays.directions[::29]), 1e-6, []
+    few = Rays(rays.origins[::29], rays.directions[::29])
+    step = 1e-6
+    found = []
     for sign in (1, -1):
         with torch.no_grad():
             bias[0] += sign * step
             again = sphere_trace(surface, few, meet_sphere(few), march).distance
-            found.append(coloured(surface, colour, few.at(again), few.directions)[:, 0])
+            found.append(surface_colours(surface, colour, few.at(again), few.directions)[:, 0])
             bias[0] -= sign * step
     off = ((found[0] - found[1]) / (2 * step) - exact).abs()
     assert off.median() < 1e-7
@@ -232,7 +255,7 @@ def coarse_hull(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("coarse_hull")
-def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photograph]) -> None:
+def test_the_hull_of_a_ball_is_a_ball_and_initialises_a_network(views: list[Photograph]) -> None:
     cameras = [view.camera.resized(3.0) for view in views]
     hull = visual_hull(seen_by(sphere(0.5), cameras))
     directions = F.normalize(torch.randn(500, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
@@ -242,12 +265,12 @@ def test_the_hull_of_a_ball_is_a_ball_and_a_network_learns_it(views: list[Photog
     assert (hull(0.3 * directions) < -0.1).all()
     assert (hull(0.9 * directions) > 0.2).all()
     state = Reconstruction.fresh(SMALL, SHORT, 8, CPU)
-    begin(state, hull, SHORT, NO_DEPTHS)
+    initialise(state, hull, SHORT, NO_DEPTHS)
     assert state.surface(0.5 * directions).abs().median() < 0.04
 
 
 @pytest.mark.usefixtures("coarse_hull")
-def test_masks_with_nothing_in_common_are_told(views: list[Photograph]) -> None:
+def test_masks_with_nothing_in_common_are_refused(views: list[Photograph]) -> None:
     empty = [replace(view, mask=torch.zeros_like(view.image[..., 0]).bool()) for view in views]
     with pytest.raises(ValueError, match="nothing lies within the masks of 8 views together"):
         visual_hull(empty)
@@ -268,25 +291,25 @@ def turned(view: Photograph, degrees: float) -> Photograph:
 
 
 @pytest.mark.usefixtures("coarse_hull")
-def test_a_view_whose_camera_is_turned_is_named() -> None:
+def test_a_view_whose_camera_is_turned_is_an_outlier() -> None:
     seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
-    assert not any(view.doubtful for view in overlaps(seen))
-    found = overlaps([*seen[:2], turned(seen[2], 15.0), *seen[3:]])
-    assert [view.name for view in found if view.doubtful] == ["02"]
+    assert not any(view.is_outlier for view in mask_overlaps(seen))
+    found = mask_overlaps([*seen[:2], turned(seen[2], 15.0), *seen[3:]])
+    assert [view.name for view in found if view.is_outlier] == ["02"]
 
 
 @pytest.mark.usefixtures("coarse_hull")
-def test_a_view_that_alone_sees_through_a_hole_is_not_doubtful() -> None:
+def test_a_view_that_alone_sees_through_a_hole_is_no_outlier() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
     above = Camera.orbit(0, 89, 3.0, height=64, width=64, focal_px=80.0)
     *others, view = seen_by(torus(0.5, 0.15), [*around, above])
-    *_, last = overlaps([*others, view])
+    *_, last = mask_overlaps([*others, view])
     assert last.iou < 0.85, "the hull of the others has no hole"
-    assert not last.doubtful
+    assert not last.is_outlier
     aside = above.T_world_camera.clone()
     aside[0, 3] += 0.5
     wrong = replace(view, camera=replace(above, T_world_camera=aside))
-    assert overlaps([*others, wrong])[-1].doubtful, "it rules out a part that others show"
+    assert mask_overlaps([*others, wrong])[-1].is_outlier, "it rules out a part that others show"
 
 
 def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
@@ -296,12 +319,14 @@ def test_a_view_is_left_out_by_its_name(views: list[Photograph]) -> None:
 
 
 def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
-    state, random = Reconstruction.fresh(SMALL, SHORT, 8, CPU), torch.Generator().manual_seed(0)
+    state = Reconstruction.fresh(SMALL, SHORT, 8, CPU)
+    random = torch.Generator().manual_seed(0)
     small = [view.at_most(32) for view in views]
-    some, matching = Pool.of(small).drawn(600, random), Matching.of(small, CPU)
+    some = PixelSampler.of(small).sample(600, random)
+    matching = PatchMatching.of(small, CPU)
     surface = CountedSurface(state.surface)
     for shapes, pulled in ((False, set[str]()), (True, {"colour", "patches"})):
-        terms = terms_of(some, matching, surface, state.colour, random, shapes, 100.0)
+        terms = loss_terms(some, matching, surface, state.colour, random, shapes, 100.0)
         weights = list(state.surface.parameters())
         for name in ("colour", "patches"):
             if terms[name].requires_grad:
@@ -313,34 +338,35 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
 
 
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:
-    config, marks = replace(SHORT, steps=12, sizes=(16, 32)), [mark(view) for view in views]
+    config = replace(SHORT, steps=12, sizes=(16, 32))
+    fingerprints = [fingerprint(view) for view in views]
     whole = Reconstruction.fresh(SMALL, config, 8, CPU)
     list(reconstruct(views, whole, config))
     half = Reconstruction.fresh(SMALL, config, 8, CPU)
     for step in reconstruct(views, half, config):
-        if step.step == 5:
+        if step == 5:
             break
-    save_reconstruction(tmp_path, half, config, marks)
-    again = load_reconstruction(tmp_path, config, SMALL, marks, CPU)
+    save_reconstruction(tmp_path, half, config, fingerprints)
+    again = load_reconstruction(tmp_path, config, SMALL, fingerprints, CPU)
     assert again.step == 5
     list(reconstruct(views, again, config))
     for one, other in zip(whole.surface.parameters(), again.surface.parameters()):
         assert torch.equal(one, other)
     with pytest.raises(ValueError, match="other rays, width; give the same, or another --out"):
-        load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), marks, CPU)
+        load_reconstruction(tmp_path, replace(config, rays=8), replace(SMALL, width=8), fingerprints, CPU)
     with pytest.raises(ValueError, match="of a run with other photographs; give the same, or another --out"):
-        load_reconstruction(tmp_path, config, SMALL, [*marks[1:], mark(turned(views[0], 1.0))], CPU)
+        load_reconstruction(tmp_path, config, SMALL, [*fingerprints[1:], fingerprint(turned(views[0], 1.0))], CPU)
     stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
-    for tampered in ({"course": {"patches": False}}, {"course": 3}, {"step": "five"}, {"seconds": None}):
+    for tampered in ({"loss_history": {"patches": False}}, {"loss_history": 3}, {"step": "five"}, {"seconds": None}):
         torch.save(stored | tampered, tmp_path / "checkpoint.pt")
         with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
-            load_reconstruction(tmp_path, config, SMALL, marks, CPU)
+            load_reconstruction(tmp_path, config, SMALL, fingerprints, CPU)
     (tmp_path / "checkpoint.pt").write_bytes(b"no")
     with pytest.raises(ValueError, match="is not a checkpoint of a reconstruction; move it away"):
-        load_reconstruction(tmp_path, config, SMALL, marks, CPU)
+        load_reconstruction(tmp_path, config, SMALL, fingerprints, CPU)
 
 
-def test_an_object_before_a_dark_background_is_told_from_it(views: list[Photograph]) -> None:
+def test_a_dark_background_gives_masks(views: list[Photograph]) -> None:
     random = torch.Generator().manual_seed(0)
     noisy = [
         replace(view, image=(view.image + 0.02 * torch.rand(view.image.shape, generator=random)).clamp(0, 1), mask=None)
@@ -374,10 +400,10 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
 def test_the_command_writes_a_mesh_in_the_folders_world(
     views: list[Photograph], tmp_path: Path, run: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("distrace.cli.reconstruct.ReconstructConfig", partial(ReconstructConfig, beginning=150))
+    monkeypatch.setattr("distrace.cli.reconstruct.ReconstructConfig", partial(ReconstructConfig, initial_steps=150))
     monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 2)
     monkeypatch.setattr("distrace.cli.reconstructed.TOLD", 1)
-    monkeypatch.setattr("distrace.reconstruction.registration.STEPS", 5)
+    monkeypatch.setattr("distrace.reconstruction.cameras.STEPS", 5)
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
     out = tmp_path / "out"

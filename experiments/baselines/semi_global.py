@@ -19,7 +19,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.errors import explained
-from distrace.photos.stereo_pairs import partners
+from distrace.photos.stereo_pairs import neighbour_views
 
 PARTNERS = 2  # of each view
 UPSCALING = 2  # subpixel matches need smooth images
@@ -97,7 +97,7 @@ def stereo_points(photographs: Sequence[Photograph]) -> Float[np.ndarray, "n 3"]
 
 
 def _pairs(photographs: Sequence[Photograph]) -> Iterator[Rectified]:
-    for number, neighbours in enumerate(partners([each.camera for each in photographs], PARTNERS).tolist()):
+    for number, neighbours in enumerate(neighbour_views([each.camera for each in photographs], PARTNERS).tolist()):
         for neighbour in neighbours:
             if neighbour >= 0:
                 yield Rectified.of(photographs[number], photographs[neighbour])

@@ -17,9 +17,8 @@ from distrace.files import save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
-from distrace.photos.outlier_views import Agreement, agreements
-from distrace.photos.residuals import Shape
-from distrace.photos.stage import Comparing
+from distrace.photos.residuals import ComparisonConfig, PlacedShape
+from distrace.photos.selection import ViewAgreement, view_agreements
 from distrace.prior import prior_of
 from distrace.report.views_page import forming, views_page
 
@@ -36,7 +35,7 @@ class Multiview:
     changing_light: Flag = False  # compare colours without their local brightness and contrast
     ignore_masks: Flag = False  # as if no photograph had one
     size: int = 1024  # pixels along the longer side; larger photographs are made smaller
-    rays: int = Comparing.rays  # of all views, in each stage
+    rays: int = ComparisonConfig.rays  # of all views, in each stage
     resolution: int = 256  # of the mesh
     seed: int = 0
     device: str = "cpu"
@@ -53,14 +52,14 @@ class Multiview:
         views = [view.at_most(self.size).to(run.device) for view in found.views]
         views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
         usual = KNOWN_PLACE if self.fixed else UNKNOWN_PLACE
-        compared = replace(usual.compared, rays=self.rays, same_light=not self.changing_light)
-        config = replace(usual, starts=self.starts, seed=self.seed, compared=compared)
+        compared = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
+        config = replace(usual, starts=self.starts, seed=self.seed, comparison=compared)
         steps = _fitted(model, views, config)
         last, prior = steps[-1], prior_of(model.codes)
-        shape = Shape(prior.coordinates(last.code), last.place)
-        agreed = agreements(model.decoder, views, prior, shape, compared)
+        shape = PlacedShape(prior.coordinates(last.code), last.place)
+        agreed = view_agreements(model.decoder, views, prior, shape, compared)
         for view in agreed:
-            if view.doubtful:
+            if view.is_outlier:
                 console.print(_doubt(view), markup=False)
         mesh = _mesh(model, last, found, resolved)
         save_mesh(run.out / "mesh.ply", mesh)
@@ -75,7 +74,7 @@ class Multiview:
                 "start": last.start,
                 "T_unit_object": last.place.T_world_object.tolist(),
                 "unit_sphere": found.placement.described(),
-                "doubtful": [view.name for view in agreed if view.doubtful],
+                "doubtful": [view.name for view in agreed if view.is_outlier],
                 "evaluations": sum(step.evaluations for step in steps),
                 "setup_evaluations": sum(step.searched for step in steps),
             }
@@ -104,5 +103,5 @@ def _described(found: Photographs) -> str:
     return f"the unit sphere lies around ({centre}) with a radius of {found.placement.radius:.4g}"
 
 
-def _doubt(view: Agreement) -> str:
+def _doubt(view: ViewAgreement) -> str:
     return f"{view.name} does not agree with the others: its colours are off by {view.colour:.2f}; is its camera right?"

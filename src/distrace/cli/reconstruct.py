@@ -14,12 +14,17 @@ from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
 from distrace.files import alone, save_json
 from distrace.mesh import MeshConfig
-from distrace.photos.multiview_depth import NO_DEPTHS, AgreedDepths
-from distrace.photos.visual_hull import Overlap, overlaps, visual_hull
-from distrace.reconstruction.initialisation import begin, telling
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction, reconstruct
-from distrace.reconstruction.run import load_reconstruction, mark, save_reconstruction
-from distrace.reconstruction.surface_network import SurfaceSpecs
+from distrace.photos.visual_hull import MaskOverlap, mask_overlaps, visual_hull
+from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths
+from distrace.reconstruction.networks import SurfaceSpecs
+from distrace.reconstruction.reconstruct import informative_depths, initialise, reconstruct
+from distrace.reconstruction.state import (
+    ReconstructConfig,
+    Reconstruction,
+    fingerprint,
+    load_reconstruction,
+    save_reconstruction,
+)
 from distrace.report.reconstruction_page import judged
 from distrace.shading import save_png
 from distrace.threads import flushed_denormals
@@ -38,7 +43,7 @@ class Reconstruct:
     views: tyro.conf.Positional[Views]
     out: Path = Path("out/reconstruct")
     steps: int = ReconstructConfig.steps  # that shape
-    retouching: int = ReconstructConfig.retouching  # steps after them, of the colours alone
+    retouching: int = ReconstructConfig.refinement_steps  # steps after them, of the colours alone
     sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
     rays: int = ReconstructConfig.rays  # of each step
     width: int = SurfaceSpecs.width  # of the surface's network
@@ -59,8 +64,8 @@ class Reconstruct:
         for note in notes(found):
             console.print(note, markup=False)
         found = replace(found, views=without(found.views, self.leave_out))
-        for each in overlaps(found.views):
-            if each.doubtful:
+        for each in mask_overlaps(found.views):
+            if each.is_outlier:
                 console.print(_doubt(each), markup=False)
         told, kept_back = parted(found.views, self.held_out)
         with alone(run.out):
@@ -69,8 +74,8 @@ class Reconstruct:
 
     @property
     def config(self) -> ReconstructConfig:
-        own = {name: getattr(self, name) for name in ("steps", "retouching", "sizes", "rays", "seed")}
-        return ReconstructConfig(**own, colours_shape=not self.silhouettes_only)
+        own = {name: getattr(self, name) for name in ("steps", "sizes", "rays", "seed")}
+        return ReconstructConfig(**own, refinement_steps=self.retouching, shape_from_colour=not self.silhouettes_only)
 
     @property
     def specs(self) -> SurfaceSpecs:
@@ -112,7 +117,7 @@ def fitted(
     saving: Every,
 ) -> Reconstruction:
     """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
-    marks = [mark(view) for view in views]
+    marks = [fingerprint(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
     if state.step:
         console.print(f"going on from step {state.step} of {config.total}")
@@ -125,34 +130,34 @@ def fitted(
     due = -(-config.total // PREVIEWS)
     with progress("reconstructing", config.total) as bar:
         for step in reconstruct(views, state, config, depths):
-            bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.course.items()), to=step.step)
-            if step.step % due == 0:
+            bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.loss_history.items()), to=step)
+            if step % due == 0:
                 small = judged(state, shown, PREVIEWED)
-                save_png(run.out / "previews" / f"{step.step:07d}.png", small.picture)
+                save_png(run.out / "previews" / f"{step:07d}.png", small.picture)
             if saving.passed():
                 save_reconstruction(run.out, state, config, marks)
     save_reconstruction(run.out, state, config, marks)
     return state
 
 
-def _begun(state: Reconstruction, views: Sequence[Photograph], config: ReconstructConfig) -> AgreedDepths:
+def _begun(state: Reconstruction, views: Sequence[Photograph], config: ReconstructConfig) -> ConsistentDepths:
     """A fresh run begins; the depths that count in the steps that are left."""
-    depths, compared = NO_DEPTHS, config.colours_shape and state.step < config.steps
+    depths, compared = NO_DEPTHS, config.shape_from_colour and state.step < config.steps
     if state.step and not compared:
         return depths
     hull = visual_hull(views)
     if compared:
         console.print("comparing photographs with their neighbours")
-        depths = telling(views, hull)
+        depths = informative_depths(views, hull)
         if len(depths):
             console.print(f"{len(depths):,} depths that photographs agree on tell what outlines do not")
     if not state.step:
         console.print("teaching the network what is known before colours")
-        begin(state, hull, config, depths)
+        initialise(state, hull, config, depths)
     return depths
 
 
-def _doubt(view: Overlap) -> str:
+def _doubt(view: MaskOverlap) -> str:
     agreed = f"its outline and that of all others have {view.iou:.0%} in common"
     return (
         f"{view.name} does not agree with the others: {agreed}; is its camera right? --leave-out {view.name} drops it"

@@ -18,9 +18,8 @@ from distrace.data.placement import Placement
 from distrace.files import save_text
 from distrace.mesh import MeshConfig
 from distrace.movie import save_gif
-from distrace.reconstruction.camera_refinement import between, drift, motions, moved, relative
-from distrace.reconstruction.reconstruct import ReconstructConfig, Reconstruction
-from distrace.reconstruction.registration import registered
+from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
+from distrace.reconstruction.state import ReconstructConfig, Reconstruction, rigid_motions
 from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
@@ -75,7 +74,7 @@ class Reconstructed:
     @cached_property
     def _drifts(self) -> list[float]:
         """By how many pixels their cameras moved."""
-        return [drift(*each) for each in zip(self.told, self._refined, strict=True)]
+        return [pixel_shift(*each) for each in zip(self.told, self._refined, strict=True)]
 
     def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
         """Views in the size that was fitted last."""
@@ -89,15 +88,15 @@ class Reconstructed:
             "_corrected": self._judged([self._corrected(view) for view in self.kept_back]),
             "_aligned": self._judged([registered(self.state, view, self.config) for view in self.kept_back]),
         }
-        method = "ours" if self.config.colours_shape else "hull"
+        method = "ours" if self.config.shape_from_colour else "hull"
         return [row_of(self.name, method, judgements, self.state.seconds)]
 
     def _corrected(self, view: Photograph) -> Photograph:
         """With its camera moved as those of its neighbours were; nothing of the photograph is looked at."""
-        steps = relative(self.state.steps_of_views.detach().cpu())
+        steps = self.state.relative_steps.detach().cpu()
         eyes = torch.stack([each.camera.T_world_camera[:3, 3] for each in self.told])
-        step = between(steps, eyes, view.camera.T_world_camera[:3, 3])
-        return moved(view, motions(step[None])[0])
+        step = interpolated_step(steps, eyes, view.camera.T_world_camera[:3, 3])
+        return moved(view, rigid_motions(step[None])[0])
 
     def _save_page(self, run: Run, mesh: trimesh.Trimesh, held_out: Sequence[Judged]) -> None:
         some = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
@@ -106,10 +105,10 @@ class Reconstructed:
             "steps": f"{self.state.step:,} of {self.config.rays} rays",
             "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
             "evaluations of the surface": f"{self.state.evaluations:,}",
-            "shaped by": "colours and outlines" if self.config.colours_shape else "outlines",
+            "shaped by": "colours and outlines" if self.config.shape_from_colour else "outlines",
             "cameras moved": f"by {median(self._drifts):.2f} pixels (median), {max(self._drifts):.2f} at most",
         }
-        text = reconstruction_page(self.name, held_out, some, self.state.course, mesh, facts)
+        text = reconstruction_page(self.name, held_out, some, self.state.loss_history, mesh, facts)
         save_text(run.out / "report.html", text)
 
     def _cameras(self) -> dict[str, object]:

@@ -1,1 +1,1 @@
-"""A code, and where its shape lies, found from photographs: no depth, no masks."""
+"""The code and the placement of a shape, fitted to photographs without depth, and masks only where they are given."""

@@ -1,7 +1,7 @@
-"""Fitting a shape's code, and where the shape lies, to photographs: no depth, no masks, known cameras.
+"""Fits a shape's code and placement to photographs with known cameras: no depth, and masks only where given.
 
-From coarse images to fine ones, by Levenberg–Marquardt. As in DIST (Liu et al., CVPR 2020, section 4.3) the shape and a
-similarity are found together, from several starts.
+Levenberg–Marquardt from coarse images to fine ones. As in DIST (Liu et al., CVPR 2020, section 4.3) the shape and a
+similarity are fitted together, from several starts.
 """
 
 import time
@@ -15,58 +15,61 @@ from distrace.data.photograph import Photograph
 from distrace.fields.decoder import Decoder
 from distrace.fitting.multistart import Starts, Step, best_of, stages_of
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
-from distrace.photos.initialisation import Search
-from distrace.photos.model_selection import contradictions
-from distrace.photos.residuals import Shape
-from distrace.photos.stage import Comparing, Stage
+from distrace.photos.initialisation import Initialiser
+from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.residuals import ComparisonConfig, PlacedShape
+from distrace.photos.selection import inconsistencies
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
-APPROACH = -1  # its steps' start
+PLACEMENT = -1  # `start` of the steps that find the placement
 
 
 @dataclass(frozen=True)
 class PhotoConfig(Starts):
-    """Stages of a pyramid; each start is tried up to the finest: coarse images do not tell which will agree with it."""
+    """The schedule. Each start is tried up to the finest level: coarse images do not tell which start is best."""
 
     iterations: int = 72
     starts: int = 4
     trial: int = 24
-    approach: int = 24  # iterations of the mean shape before all starts, to find the place where it is unknown
-    levels: tuple[float, ...] = (*4 * (0.5,), *14 * (1.0,))  # of the images' size, a stage each: new rays
-    compared: Comparing = Comparing()
-    scale: float = 0.06  # up to which misplaced outlines count by their squares in the first stage …
-    narrowing: float = 0.6  # … and × this from one to the next, …
-    narrowest: float = 0.005  # … but no narrower
+    place_iterations: int = 24  # of the mean shape, before all starts, where the placement is unknown
+    levels: tuple[float, ...] = (*4 * (0.5,), *14 * (1.0,))  # factors of the images' size, each with new rays
+    comparison: ComparisonConfig = ComparisonConfig()
+    outline_scale: float = 0.06  # of outline residuals, in radii, at the first level …
+    outline_decay: float = 0.6  # … × this from one level to the next, …
+    outline_least: float = 0.005  # … and no less than this
     damping: float = 0.1
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.approach < 1:
-            raise ValueError(f"{self.approach} iterations were given to approach in; at least 1 is needed")
+        if self.place_iterations < 1:
+            raise ValueError(f"{self.place_iterations} iterations were given for the placement; at least 1 is needed")
         if not self.levels or not all(0 < level <= 1 for level in self.levels):
             raise ValueError(f"levels {self.levels} were given; each is a part of the images' size, up to 1")
 
     @property
     def total(self) -> int:
-        return super().total + (min(self.approach, self.iterations) if self.compared.moves else 0)
+        """Iterations of all starts, and of the placement."""
+        return super().total + (min(self.place_iterations, self.iterations) if self.comparison.fit_place else 0)
 
 
 UNKNOWN_PLACE = PhotoConfig()
-KNOWN_PLACE = PhotoConfig(iterations=48, levels=(*4 * (0.5,), *8 * (1.0,)), compared=Comparing(moves=False))
-"""For a shape that lies as the model's do: its code alone is found sooner."""
+KNOWN_PLACE = PhotoConfig(
+    iterations=48, levels=(*4 * (0.5,), *8 * (1.0,)), comparison=ComparisonConfig(fit_place=False)
+)
+"""For a shape that lies as the model's do: its code alone takes fewer iterations."""
 
 
 @dataclass(frozen=True)
 class PhotoStep(Step):
-    """The code and the place after an iteration."""
+    """The code and the placement after an iteration."""
 
     place: Similarity = field(default_factory=Similarity.identity)
-    searched: int = 0  # of the evaluations, those of the search for places and starts
+    searched: int = 0  # of the evaluations, those of the initialisation
 
     @property
     def name(self) -> str:
-        return "approach" if self.start == APPROACH else super().name
+        return "placement" if self.start == PLACEMENT else super().name
 
 
 def fit_photos(
@@ -76,24 +79,20 @@ def fit_photos(
     config: PhotoConfig = UNKNOWN_PLACE,
     place: Similarity | None = None,
 ) -> Iterator[PhotoStep]:
-    """Fits a shape to photographs whose cameras see the unit sphere. The last step is the result.
+    """Fits a shape to photographs whose cameras see the unit sphere, on the prior's device; yields every step.
 
-    Where the place is unknown it is found first, with the mean shape, from that given or, if typical shapes contradict
-    the photographs less there, from where they tell. There all starts begin: the mean shape again, the training shapes
-    of the least loss, and one draw from the prior. The one that is off least by what all of them together take for the
-    object goes on. On the prior's device, wherever the photographs are. Raises `ValueError` for fewer than two of them.
+    An unknown placement is fitted first, with the mean shape, from `place` (by default the identity) or from
+    `Initialiser.locate`, whichever contradicts the photographs less. Then all starts begin there: the mean shape, the
+    training shapes of the least loss, and a draw from the prior. The start with the least inconsistency goes on,
+    and its last step is the result. Raises `ValueError` for fewer than two photographs.
     """
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
-    device, place = prior.mean.device, place or Similarity.identity()
-    stages = _pyramid([each.to(device) for each in photographs], config)
-    return _Fit(decoder, prior, config, stages).steps(place.to(device))
-
-
-def _pyramid(photographs: Sequence[Photograph], config: PhotoConfig) -> list[Stage]:
-    """A stage for each level; those of one level are the same."""
-    kinds = {level: Stage.of(photographs, level, config.compared) for level in sorted(set(config.levels))}
-    return [kinds[level] for level in config.levels]
+    device = prior.mean.device
+    moved = [photograph.to(device) for photograph in photographs]
+    levels = {factor: PyramidLevel.of(moved, factor, config.comparison) for factor in sorted(set(config.levels))}
+    fit = _Fit(decoder, prior, config, [levels[factor] for factor in config.levels])
+    return fit.steps((place or Similarity.identity()).to(device))
 
 
 @dataclass(frozen=True)
@@ -103,62 +102,79 @@ class _Fit:
     decoder: Decoder
     prior: Prior
     config: PhotoConfig
-    stages: Sequence[Stage]
+    levels: Sequence[PyramidLevel]
 
     def steps(self, place: Similarity) -> Iterator[PhotoStep]:
+        """The steps of the placement, where it is unknown, and of all starts."""
         config = self.config
-        if config.compared.moves:
-            for step in self._approached(place):
+        if config.comparison.fit_place:
+            for step in self._fit_place(place):
                 yield step
                 place = step.place
-        began, search = time.perf_counter(), Search(self.decoder, self.prior, config.seed)
-        starts = [Shape(w, place) for w in search.starts(self.stages[0], config.compared, place, config.starts)]
-        steps = best_of(config, lambda start: self._solved(start, starts[start]), self._compared)
-        yield from _charged(steps, search, time.perf_counter() - began)
+        began = time.perf_counter()
+        initialiser = Initialiser(self.decoder, self.prior, config.seed)
+        starts = initialiser.starts(self.levels[0], config.comparison, place, config.starts)
+        steps = best_of(config, lambda start: self._fit(start, PlacedShape(starts[start], place)), self._judged)
+        yield from _charged(steps, initialiser, time.perf_counter() - began)
 
-    def _approached(self, place: Similarity) -> Iterator[PhotoStep]:
-        """The mean shape's, which end where it lies: in a wrong place wrong training shapes fit best."""
-        began, config = time.perf_counter(), self.config
-        search = Search(self.decoder, self.prior, config.seed)
-        place = search.likelier(self.stages[0], config.compared, (place, search.told(self.stages[-1], place)))
-        searched, mean = time.perf_counter() - began, Shape(self.prior.start(0, config.seed), place)
-        yield from _charged(islice(self._solved(APPROACH, mean), config.approach), search, searched)
+    def _fit_place(self, place: Similarity) -> Iterator[PhotoStep]:
+        """Fits the mean shape: in a wrong place wrong training shapes fit best."""
+        began = time.perf_counter()
+        config = self.config
+        initialiser = Initialiser(self.decoder, self.prior, config.seed)
+        places = (place, initialiser.locate(self.levels[-1], place))
+        place = initialiser.likelier(self.levels[0], config.comparison, places)
+        seconds = time.perf_counter() - began
+        steps = self._fit(PLACEMENT, PlacedShape(self.prior.start(0, config.seed), place))
+        yield from _charged(islice(steps, config.place_iterations), initialiser, seconds)
 
-    def _solved(self, start: int, shape: Shape) -> Iterator[PhotoStep]:
-        config, prior = self.config, self.prior
-        began, done, damping, expected = time.perf_counter(), 0, config.damping, shape.place
+    def _fit(self, start: int, shape: PlacedShape) -> Iterator[PhotoStep]:
+        """The steps of one start, level by level."""
+        config = self.config
+        prior = self.prior
+        expected_place = shape.place
+        damping = config.damping
         random = torch.Generator().manual_seed(config.seed)
-        for number, length in stages_of(config.iterations, len(self.stages)):
-            stage = self.stages[number]
-            glimpse = stage.glimpse(self.decoder, prior, shape, config.compared.rays, random)
-            problem, look = stage.problem(glimpse, config.compared)
-            problem.expected = expected
-            problem.scale, evaluations = max(config.scale * config.narrowing**number, config.narrowest), 0
-            solver = SolverConfig(length, damping, even=True, kernel=charbonnier, settled=0.0)
-            for found in minimise(problem.residuals, look, problem.moved, solver):
-                shape, damping, done = found.state.shape, found.damping, done + 1
-                terms = problem.terms(found.state, found.residuals)
-                seconds, before, evaluations = time.perf_counter() - began, evaluations, problem.evaluations
-                loss, code = sum(terms.values()), prior.code(shape.w)
-                yield PhotoStep(start, done, loss, terms, code, seconds, evaluations - before, place=shape.place)
+        iteration = 0
+        began = time.perf_counter()
+        for number, iterations in stages_of(config.iterations, len(self.levels)):
+            level = self.levels[number]
+            sample = level.sample(self.decoder, prior, shape, config.comparison.rays, random)
+            problem, state = level.problem(sample, config.comparison)
+            problem.expected_place = expected_place
+            problem.outline_scale = max(config.outline_scale * config.outline_decay**number, config.outline_least)
+            solver = SolverConfig(iterations, damping, even=True, kernel=charbonnier, settled=0.0)
+            counted = 0
+            for solution in minimise(problem.residuals, state, problem.retract, solver):
+                shape = solution.state.shape
+                damping = solution.damping
+                iteration += 1
+                terms = problem.terms(solution.state, solution.residuals)
+                loss = sum(terms.values())
+                seconds = time.perf_counter() - began
+                evaluations = problem.evaluations - counted
+                code = prior.code(shape.w)
+                yield PhotoStep(start, iteration, loss, terms, code, seconds, evaluations, place=shape.place)
                 began = time.perf_counter()
+                counted = problem.evaluations
 
-    def _compared(self, trials: Sequence[Sequence[PhotoStep]]) -> list[PhotoStep]:
-        """Their ends, judged by what all of them together take for the object."""
-        began, ends = time.perf_counter(), [trial[-1] for trial in trials]
-        shapes = [Shape(self.prior.coordinates(end.code), end.place) for end in ends]
-        compared, seed = self.config.compared, self.config.seed
-        found = contradictions(self.stages[-1], self.decoder, self.prior, shapes, compared, seed)
-        seconds = (time.perf_counter() - began) / len(ends)
+    def _judged(self, trials: Sequence[Sequence[PhotoStep]]) -> list[PhotoStep]:
+        """The trials' last steps with their inconsistencies as verdicts."""
+        began = time.perf_counter()
+        last = [trial[-1] for trial in trials]
+        shapes = [PlacedShape(self.prior.coordinates(step.code), step.place) for step in last]
+        comparison = self.config.comparison
+        found = inconsistencies(self.levels[-1], self.decoder, self.prior, shapes, comparison, self.config.seed)
+        seconds = (time.perf_counter() - began) / len(last)
         return [
-            replace(end, verdict=off, seconds=seconds, evaluations=evaluations)
-            for end, (off, evaluations) in zip(ends, found, strict=True)
+            replace(step, verdict=verdict, seconds=seconds, evaluations=evaluations)
+            for step, (verdict, evaluations) in zip(last, found, strict=True)
         ]
 
 
-def _charged(steps: Iterator[PhotoStep], search: Search, seconds: float) -> Iterator[PhotoStep]:
-    """The first of them with what the search before has taken."""
+def _charged(steps: Iterator[PhotoStep], initialiser: Initialiser, seconds: float) -> Iterator[PhotoStep]:
+    """The steps, of which the first is charged with the initialisation's time and evaluations."""
     step = next(steps)
-    evaluations = step.evaluations + search.evaluations
-    yield replace(step, seconds=step.seconds + seconds, evaluations=evaluations, searched=search.evaluations)
+    evaluations = step.evaluations + initialiser.evaluations
+    yield replace(step, seconds=step.seconds + seconds, evaluations=evaluations, searched=initialiser.evaluations)
     yield from steps

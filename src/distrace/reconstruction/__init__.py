@@ -1,1 +1,1 @@
-"""Shape and colours of an object that no class knows: a network of its own, learnt from photographs."""
+"""Shape and colours of any object: networks of its own, fitted to photographs without a prior."""

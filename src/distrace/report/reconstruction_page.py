@@ -16,8 +16,8 @@ from distrace.data.photograph import Photograph, averaged
 from distrace.fields.base import value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import iou
-from distrace.reconstruction.reconstruct import Reconstruction
-from distrace.reconstruction.terms import coloured
+from distrace.reconstruction.losses import surface_colours
+from distrace.reconstruction.state import Reconstruction
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
 from distrace.report.page import Html, figure, page, paragraph, section, table
@@ -64,11 +64,11 @@ def seen(
 ) -> tuple[Buffers, Bool[Tensor, "height width"], Float[Tensor, "height width 3"]]:
     """The surface before a photograph's camera, `FINER` in each direction; pixels of which it covers more than half;
     and their colours, as a camera has them: means over a pixel's area, of which what is not hit is black."""
-    camera = view.camera.resized(float(FINER)).to(state.surface.last.weight.device)
+    camera = view.camera.resized(float(FINER)).to(state.device)
     buffers = render(state.surface, camera)
     made = torch.zeros_like(buffers.rays.directions)
     hits = zip(buffers.points.split(AT_ONCE), buffers.rays.directions[buffers.mask].split(AT_ONCE), strict=True)
-    parts = [coloured(state.surface, state.colour, *some) for some in hits]
+    parts = [surface_colours(state.surface, state.colour, *some) for some in hits]
     made[buffers.mask] = torch.cat(parts) if parts else made[:0, 0]
     covered = averaged(buffers.mask[..., None].cpu().float(), 1 / FINER)[..., 0]
     return buffers, covered > 0.5, averaged(made.cpu(), 1 / FINER).float()
@@ -82,7 +82,7 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
     parts = []
     for points in vertices.split(AT_ONCE):
         _, gradient = value_and_gradient(state.surface, points)
-        parts.append(coloured(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
+        parts.append(surface_colours(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
     colours = (255 * torch.cat(parts)).round().byte().cpu().numpy()
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 

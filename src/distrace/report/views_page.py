@@ -12,7 +12,7 @@ from distrace.checkpoints.model import Model
 from distrace.data.photograph import Photograph
 from distrace.fitting.ray_sampling import band
 from distrace.photos.fit_photos import PhotoStep
-from distrace.photos.outlier_views import Agreement
+from distrace.photos.selection import ViewAgreement
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
 from distrace.report.completion_page import View
@@ -29,7 +29,7 @@ def views_page(
     model: Model,
     views: Sequence[Photograph],
     steps: Sequence[PhotoStep],
-    agreed: Sequence[Agreement],
+    agreed: Sequence[ViewAgreement],
     mesh: trimesh.Trimesh,
 ) -> str:
     """Photographs with the outline of the fitted shape, the shape, and what each view is off by."""
@@ -39,7 +39,7 @@ def views_page(
     losses: dict[str, list[float]] = {}
     for step in steps:
         losses.setdefault(step.name, []).append(step.loss)
-    cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.doubtful else ""] for view in agreed]
+    cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.is_outlier else ""] for view in agreed]
     lead = f"A shape from {len(views)} photographs, by the model {model.name}. No depth was known."
     about = "How far colours, from 0 to 1, are from those of the same points in other views: the median."
     return page(

@@ -1,0 +1,160 @@
+"""One level of the pyramid of photographs: sampled rays, labels of their pixels, and the views that see each point."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from distrace.data.photograph import Photograph
+from distrace.fields.base import SDF, Counted
+from distrace.fields.decoder import Decoder
+from distrace.fitting.ray_sampling import drawn
+from distrace.photos.colour_segmentation import ColourModel, appearance
+from distrace.photos.residuals import MARCH, ComparisonConfig, PhotoProblem, PlacedShape, RayObservations, TracedShape
+from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
+from distrace.photos.visual_hull import CrossViewConsistency
+from distrace.pose import Similarity
+from distrace.prior import Prior
+from distrace.rays import Bounds, Rays, meet_sphere
+from distrace.surface import normals
+from distrace.tracing.sphere_tracing import Trace, sphere_trace
+
+OCCLUSION_START = 0.03  # radii from a surface point at which the search for an occluder starts
+LEAST_COSINE = 0.2  # between a normal and the direction to another view that sees the point
+LEAST_CERTAINTY = 0.3  # below it a pixel's label is unknown
+NEAR_SURFACE = 0.1  # background rays whose least value is larger are left out
+
+Labels = Sequence[Float[Tensor, "height width"]]
+"""Each view's certainty that a pixel shows the object, up to 1, or the background, down to −1; 0 where unknown."""
+
+
+@dataclass(frozen=True)
+class SampledRays:
+    """Rays of all views, view by view, with a shape traced along them."""
+
+    decoder: Decoder
+    prior: Prior
+    shape: PlacedShape
+    sdf: Counted
+    view: Int[Tensor, "n"]
+    pixel: Int[Tensor, "n"]  # flat index in the view
+    rays_world: Rays
+    rays_object: Rays
+    trace: Trace
+
+
+@dataclass(frozen=True)
+class PyramidLevel:
+    """Photographs at one level of the pyramid."""
+
+    photographs: Sequence[Photograph]
+    images: Sequence[GradientImage]  # the colours that are compared
+    neighbours: Int[Tensor, "views count"]  # −1 where there are fewer
+    appearances: Sequence[Float[Tensor, "height width 4"]]  # for the segmentation
+    meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
+    consistency: CrossViewConsistency
+
+    @staticmethod
+    def of(photographs: Sequence[Photograph], factor: float, config: ComparisonConfig) -> "PyramidLevel":
+        """The level of photographs whose size is × `factor`."""
+        coarse = [photograph.resized(factor) for photograph in photographs]
+        cameras = [each.camera for each in coarse]
+        images = [
+            GradientImage.of(each.image if config.same_light else normalise_light(each.image), each.camera)
+            for each in coarse
+        ]
+        neighbours = neighbour_views(cameras, config.neighbours)
+        appearances = [appearance(each.image) for each in coarse]
+        meets = [meet_sphere(camera.rays()).meets.reshape(-1) for camera in cameras]
+        return PyramidLevel(coarse, images, neighbours, appearances, meets, CrossViewConsistency.of(cameras))
+
+    @torch.no_grad()
+    def sample(
+        self, decoder: Decoder, prior: Prior, shape: PlacedShape, rays: int, random: torch.Generator
+    ) -> SampledRays:
+        """Draws rays that meet the unit sphere, as many from each view, and traces a shape along them."""
+        share = -(-rays // len(self.photographs))
+        chosen = [drawn(meets.nonzero()[:, 0], share, random) for meets in self.meets]
+        view = torch.cat([torch.full_like(pixels, number) for number, pixels in enumerate(chosen)])
+        parts = [
+            photograph.camera.rays(photograph.camera.pixels().reshape(-1, 2)[pixels])
+            for photograph, pixels in zip(self.photographs, chosen, strict=True)
+        ]
+        rays_world = Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
+        rays_object = shape.place.rays_in_object(rays_world)
+        sdf = Counted(decoder.field(prior.code(shape.w)))
+        trace = sphere_trace(sdf, rays_object, meet_sphere(rays_object), MARCH)
+        return SampledRays(decoder, prior, shape, sdf, view, torch.cat(chosen), rays_world, rays_object, trace)
+
+    @torch.no_grad()
+    def problem(
+        self, sample: SampledRays, config: ComparisonConfig, labels: Labels | None = None
+    ) -> tuple[PhotoProblem, TracedShape]:
+        """The residuals on sampled rays, and the shape's state; `labels` are by default the shape's own."""
+        shape = sample.shape
+        trace = sample.trace
+        colour = _read(sample, [each.channels[:3].permute(1, 2, 0) for each in self.images])
+        label = _read(sample, [each[..., None] for each in labels or self.labels(sample)])[:, 0]
+        least = sample.sdf(sample.rays_object.at(trace.closest.nan_to_num(posinf=0.0)))
+        far = ~trace.hit & (least > NEAR_SURFACE)
+        kept = (trace.hit | (label > 0) | (label < 0) & ~far).nonzero()[:, 0]
+        observations = RayObservations(sample.rays_world, sample.view, colour, label)[kept]
+        trace = trace[kept]
+        compared = (trace.hit & (observations.label >= 0)).nonzero()[:, 0]
+        points = sample.rays_object[kept][compared].at(trace.distance[compared])
+        rows, neighbours = self._visible(observations.view[compared], shape.place, points, sample.sdf)
+        pairs = torch.stack([compared[rows], neighbours], dim=1)
+        problem = PhotoProblem(sample.decoder, sample.prior, observations, self.images, pairs, config, shape.place)
+        problem.evaluations = sample.sdf.evaluations
+        return problem, problem.trace(shape, TracedShape(shape, trace.closest, trace.hit, trace.hit))
+
+    @torch.no_grad()
+    def labels(self, sample: SampledRays) -> Labels:
+        """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses.
+
+        Pixels that look like the object where most other views rule it out are unknown.
+        """
+        looks = _read(sample, self.appearances)
+        hit = sample.trace.hit
+        outside = [looks.reshape(-1, 4)[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
+        background = torch.cat([looks[~hit], *outside])
+        is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
+        model = ColourModel.of(torch.cat([looks[hit], background]), is_object)
+        certainties = [2 * model.smooth_probability(looks) - 1 for looks in self.appearances]
+        silhouettes = self.consistency.silhouettes([certainty > 0 for certainty in certainties])
+        return [
+            2.0 * photograph.mask - 1
+            if photograph.mask is not None
+            else certainty.masked_fill((certainty > 0) & ~silhouette | (certainty.abs() < LEAST_CERTAINTY), 0.0)
+            for photograph, certainty, silhouette in zip(self.photographs, certainties, silhouettes, strict=True)
+        ]
+
+    def _visible(
+        self, view: Int[Tensor, "n"], place: Similarity, points_object: Float[Tensor, "n 3"], sdf: SDF
+    ) -> tuple[Int[Tensor, "pairs"], Int[Tensor, "pairs"]]:
+        """Pairs of a point and a neighbour of its view that sees it: not too flatly, within its image, unoccluded."""
+        neighbours = self.neighbours[view]
+        row, column = (neighbours >= 0).nonzero().T
+        other = neighbours[row, column]
+        points = points_object[row]
+        normal = normals(sdf, points_object)[row]
+        eyes = torch.stack([image.camera.T_world_camera[:3, 3] for image in self.images])[other]
+        to_eye = place.to_object(eyes) - points
+        rays = Rays(points, to_eye / to_eye.norm(dim=-1, keepdim=True))
+        visible = (rays.directions * normal).sum(-1) > LEAST_COSINE
+        for number, image in enumerate(self.images):
+            in_view = other == number
+            visible[in_view] &= image.camera.shows(*image.camera.project(place.to_world(points[in_view])))
+        rays = rays[visible]
+        to_sphere = Bounds(torch.full_like(rays.origins[:, 0], OCCLUSION_START), meet_sphere(rays).far)
+        clear = ~sphere_trace(sdf, rays, to_sphere, MARCH).hit
+        return row[visible][clear], other[visible][clear]
+
+
+def _read(sample: SampledRays, images: Sequence[Float[Tensor, "height width c"]]) -> Float[Tensor, "n c"]:
+    """The images' values, one image a view, at the pixels of the sampled rays."""
+    return torch.cat(
+        [image.reshape(-1, image.shape[-1])[sample.pixel[sample.view == view]] for view, image in enumerate(images)]
+    )
