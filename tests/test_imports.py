@@ -7,11 +7,11 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("threads", "errors", "files", "processes", "equality", "pixels", "rays", "viewpoint", "camera", "pose"),
+    *("threads", "optional", "errors", "files", "processes", "equality", "pixels", "rays", "viewpoint", "camera", "pose"),
     *("fields", "checkpoints", "prior"),
     *("tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
-    *("training", "fitting", "photos", "reconstruction"),
+    *("training", "fitting", "photos", "reconstruction", "public"),
     *("report", "benchmarks", "cli", "__main__"),
 ]
 SHELL = set(ORDER[ORDER.index("report") :])

@@ -6,6 +6,8 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from distrace.optional import MissingLibrary
+
 NO_SPACE = (errno.ENOSPC, errno.EDQUOT)
 
 
@@ -23,12 +25,12 @@ def explained(sentence: str, file: Path | None = None) -> Generator[None, None, 
     """Raises any error inside again as `ValueError(sentence)`, with its cause.
 
     The cause is what lies in place of `file`, if that is a Git LFS pointer or a web page; else the error's first
-    sentence. Ctrl-C and a full disk pass through: no file that is read is to blame for them.
+    sentence. Ctrl-C, a full disk and a missing library pass through: no file that is read is to blame for them.
     """
     try:
         yield
     except Exception as error:
-        if isinstance(error, OSError) and error.errno in NO_SPACE:
+        if isinstance(error, MissingLibrary) or (isinstance(error, OSError) and error.errno in NO_SPACE):
             raise
         cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]
         cause = f"no key {cause}" if isinstance(error, KeyError) else cause

@@ -3,19 +3,21 @@
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import av
 import numpy as np
-from av.video.reformatter import ColorRange, Colorspace
 from jaxtyping import UInt8
-from PIL import Image
 
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.files import written
+from distrace.optional import require
 from distrace.render import Buffers, Config, render
 from distrace.shading import Picture
 from distrace.tracing.tracer import TracerConfig
+
+if TYPE_CHECKING:
+    import av
 
 Pictures = UInt8[np.ndarray, "frames height width 3"]
 
@@ -52,6 +54,10 @@ def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
 
     Its sides are even: odd ones get a white row below, a white column on the right. Raises `ValueError` for no picture.
     """
+    require("a movie", "av")
+    import av
+    from av.video.reformatter import ColorRange
+
     _, height, width, _ = _some(pictures).shape
     even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
     with written(path) as file:  # by its name: to bring the index to the front, the file is read again
@@ -70,6 +76,8 @@ def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
 
     Pictures that equal the one before become one with it, shown for longer. Raises `ValueError` for no picture.
     """
+    from PIL import Image
+
     _, _, width, _ = _some(pictures).shape
     palette = Image.fromarray(pictures.reshape(-1, width, 3)).quantize()
     images = [Image.fromarray(picture) for picture in pictures]
@@ -84,7 +92,10 @@ def _some(pictures: Pictures) -> Pictures:
     return pictures
 
 
-def _encodable(picture: Picture) -> av.VideoFrame:
+def _encodable(picture: Picture) -> "av.VideoFrame":
     """In the colours that the stream says it has: who plays it would guess otherwise."""
+    import av
+    from av.video.reformatter import ColorRange, Colorspace
+
     frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
     return frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)

@@ -1,6 +1,7 @@
 """Buffers to pictures: pure functions from images to uint8 colours [height, width, 3] on a white background."""
 
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ Array = Tensor | np.ndarray
 Picture = UInt8[np.ndarray, "_ _ 3"]  # of any size: some are larger than what they are drawn from
 Colour = tuple[int, int, int]
 
+COLOUR_MAPS = ("viridis", "coolwarm")  # the rows of colour_maps.png, so that pictures need no matplotlib
 WHITE: Colour = (255, 255, 255)
 INK: Colour = (56, 64, 77)
 # Told apart by people who see no difference between red and green.
@@ -154,9 +156,15 @@ def _key_light(towards: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray
 
 def _mapped(name: str, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 3"]:
     """Returns the colours of values from 0 to 1 by one of matplotlib's colour maps."""
-    from matplotlib import colormaps  # a fifth of a second, for pictures alone
+    levels = _colour_maps()[COLOUR_MAPS.index(name)]
+    return levels[np.clip((values * len(levels)).astype(int), 0, len(levels) - 1)] / 255
 
-    return colormaps[name](values)[..., :3]
+
+@cache
+def _colour_maps() -> UInt8[np.ndarray, "maps 256 3"]:
+    from PIL import Image
+
+    return np.array(Image.open(Path(__file__).with_name("colour_maps.png")))
 
 
 def _unit(vector: np.ndarray) -> np.ndarray:

@@ -15,7 +15,6 @@ from zipfile import BadZipFile
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy import ndimage
 from torch import Tensor
 
 from distrace.benchmarks.measuring import OUTLIER, in_turn, reference_depth
@@ -128,6 +127,8 @@ def _digest(view: View) -> str:
 
 def largest_part(mask: Bool[np.ndarray, "height width"]) -> int:
     """Returns the pixels of the largest part connected by edges or corners; 0 for an empty mask."""
+    from scipy import ndimage
+
     labels = np.zeros(mask.shape, dtype=np.int32)
     ndimage.label(mask, structure=np.ones((3, 3)), output=labels)
     return int(np.bincount(labels.ravel())[1:].max(initial=0))

@@ -4,7 +4,6 @@ Boxes stay boxes, and symmetric shapes stay symmetric. Distances change, so vari
 """
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from distrace.data.solid import Solid, normalised_frame
@@ -27,11 +26,14 @@ def lopsided(solid: Solid, axis: int = 0, count: int = 2000) -> bool:
 
 def warped(solid: Solid, random: np.random.Generator) -> Solid:
     """A random variant in the unit sphere; one in two is mirrored in x."""
+    import trimesh
+    from trimesh.remesh import subdivide_to_size
+
     mirrored = np.array([1 - 2 * random.integers(2), 1, 1])
     maps = [_axis_map(random, even=axis != 1 and not lopsided(solid, axis)) for axis in range(3)]
 
-    def mapped(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
-        vertices, faces, *_ = trimesh.remesh.subdivide_to_size(mesh.vertices, mesh.faces, EDGE, max_iter=20)
+    def mapped(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
+        vertices, faces, *_ = subdivide_to_size(mesh.vertices, mesh.faces, EDGE, max_iter=20)
         moved = np.stack([np.interp(vertices[:, axis], KNOTS, maps[axis]) for axis in range(3)], axis=1) * mirrored
         return trimesh.Trimesh(moved, faces if mirrored[0] > 0 else faces[:, ::-1], process=False)
 

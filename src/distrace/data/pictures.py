@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from PIL import Image
 from torch import Tensor
 
 from distrace.errors import explained
@@ -57,6 +56,8 @@ def read_mask(path: Path) -> Bool[Tensor, "height width"]:
 
 def picture_size(path: Path) -> tuple[int, int]:
     """Height and width in pixels, as stored; raises `ValueError` for a file that is no PNG or JPEG."""
+    from PIL import Image
+
     with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             return file.height, file.width
@@ -73,6 +74,8 @@ def save_mask(path: Path, mask: Bool[Tensor, "height width"]) -> None:
 
 
 def _levels(path: Path) -> Float[Tensor, "height width channels"]:
+    from PIL import Image
+
     with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             full = 65535 if file.mode in DEEP else 255
@@ -84,5 +87,7 @@ def _levels(path: Path) -> Float[Tensor, "height width channels"]:
 
 
 def _save(path: Path, levels: np.ndarray) -> None:
+    from PIL import Image
+
     with written(path) as file:
         Image.fromarray(levels).save(file, "PNG")

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import trimesh
 from jaxtyping import Float
 
 from distrace.data.solid import Solid, first_met
@@ -77,7 +76,9 @@ def lost(solid: Solid, count: int = 5000) -> float:
 
 def thin(solid: Solid, count: int = 5000) -> float:
     """The share of the surface behind which the solid is thinner than THIN: a sheet with a face on either side."""
-    points, faces = trimesh.sample.sample_surface(solid.surface, count, seed=0)[:2]
+    from trimesh.sample import sample_surface
+
+    points, faces = sample_surface(solid.surface, count, seed=0)[:2]
     inwards = -solid.surface.face_normals[faces]
     return float((first_met(solid.surface, points + 1e-5 * inwards, inwards) < THIN).mean())
 

@@ -8,16 +8,18 @@ Barill et al., SIGGRAPH 2018); its surface is the part of the soup across which 
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import igl
 import numpy as np
-import trimesh
 from jaxtyping import Bool, Float
 
 from distrace.data.ac3d import load_ac3d
 from distrace.data.shapes import Shape
 from distrace.errors import explained
+from distrace.optional import require
+
+if TYPE_CHECKING:
+    import trimesh
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
 OFFSET = 3e-4  # distance from a face at which its two sides are tested
@@ -25,6 +27,7 @@ SPACING = 0.02  # between the test points of one face
 LEAST_VOLUME = 1e-9  # of a closed part that has an inside
 OPEN = 0.15  # of a part's area: larger holes make it a sheet
 ASCII = bytes(range(128)) + b"?" * 128  # what each byte becomes
+PURPOSE = "telling a mesh's inside from its outside"  # libigl's winding numbers
 SMALLEST = 0.01  # faces partly inside are split until their edges are this short
 
 
@@ -32,8 +35,8 @@ SMALLEST = 0.01  # faces partly inside are split until their edges are this shor
 class Solid:
     """A solid in the unit sphere: every face it came with, and its outer surface with normals pointing out."""
 
-    soup: trimesh.Trimesh
-    surface: trimesh.Trimesh
+    soup: "trimesh.Trimesh"
+    surface: "trimesh.Trimesh"
 
     def winding(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         return _winding(self.soup, points)
@@ -47,6 +50,9 @@ class Solid:
 
     def apart(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """Distance to the outer surface, from either side: its sign costs winding numbers."""
+        require(PURPOSE, "igl")
+        import igl
+
         surface = self.surface
         squared, _, _ = igl.point_mesh_squared_distance(points, surface.vertices, surface.faces.astype(np.int64))
         return np.sqrt(squared)
@@ -78,8 +84,10 @@ def mesh_of(shape: Shape, meshes: Path) -> Path:
     raise ValueError(f"{meshes / shape.path} is missing; `distrace data furniture` and `… planes` fetch the meshes")
 
 
-def load_soup(path: Path) -> trimesh.Trimesh:
+def load_soup(path: Path) -> "trimesh.Trimesh":
     """All triangles of a file, as they are."""
+    import trimesh
+
     if path.suffix.lower() == ".ac":  # trimesh does not know AC3D
         corners = load_ac3d(path)
         return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
@@ -92,6 +100,8 @@ def load_geometry(path: Path, **options: Any) -> Any:
 
     Bytes of names and comments that are not ASCII become question marks: trimesh takes only UTF-8.
     """
+    import trimesh
+
     kind = path.suffix.lower().removeprefix(".")
     if kind not in ("obj", "off", "stl", "ply"):
         return trimesh.load(path, process=False, **options)
@@ -113,11 +123,15 @@ def turned(solid: Solid, degrees: float) -> Solid:
 
 def turn_matrix(degrees: float) -> Float[np.ndarray, "4 4"]:
     """The rotation about the y axis."""
-    return np.asarray(trimesh.transformations.rotation_matrix(np.radians(degrees), [0, 1, 0]))
+    from trimesh.transformations import rotation_matrix
+
+    return np.asarray(rotation_matrix(np.radians(degrees), [0, 1, 0]))
 
 
-def normalised(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+def normalised(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
     """Centred on its bounding box and scaled so that the farthest vertex lies at `RADIUS`."""
+    import trimesh
+
     middle, scale = normalised_frame(mesh)
     scaled = trimesh.Trimesh((mesh.vertices - middle) * scale, mesh.faces, process=False)
     scaled.update_faces(scaled.area_faces > 1e-14)
@@ -126,7 +140,7 @@ def normalised(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
     return scaled
 
 
-def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
+def normalised_frame(mesh: "trimesh.Trimesh") -> tuple[np.ndarray, float]:
     """The middle of the bounding box, and what scales the farthest vertex to `RADIUS`."""
     used = np.asarray(mesh.vertices, dtype=np.float64)[np.unique(mesh.faces)]
     if not len(used) or not np.isfinite(used).all():
@@ -135,11 +149,13 @@ def normalised_frame(mesh: trimesh.Trimesh) -> tuple[np.ndarray, float]:
     return middle, RADIUS / max(np.linalg.norm(used - middle, axis=1).max(), np.finfo(np.float64).tiny)
 
 
-def oriented(soup: trimesh.Trimesh) -> trimesh.Trimesh:
+def oriented(soup: "trimesh.Trimesh") -> "trimesh.Trimesh":
     """The soup with its closed parts facing outwards: where parts overlap, winding numbers of both signs cancel.
 
     A closed part that faces inwards and lies within others stays as it is: it is a cavity.
     """
+    import trimesh
+
     part, volume, closed = _parts(soup)
     faces = np.array(soup.faces)
     if volume.sum() < 0:
@@ -157,14 +173,16 @@ def oriented(soup: trimesh.Trimesh) -> trimesh.Trimesh:
     return mesh
 
 
-def _parts(soup: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _parts(soup: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The number of each face's connected part; of each part its signed volume, and whether it is closed but for holes.
 
     The area vectors of a closed surface add up to zero, those of a sheet to its area.
     """
+    from trimesh.graph import connected_component_labels
+
     merged = soup.copy()
     merged.merge_vertices()
-    part = trimesh.graph.connected_component_labels(merged.face_adjacency, node_count=len(merged.faces))
+    part = connected_component_labels(merged.face_adjacency, node_count=len(merged.faces))
     area = np.bincount(part, soup.area_faces)
 
     def integral(values: np.ndarray) -> np.ndarray:
@@ -178,9 +196,10 @@ def _parts(soup: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def first_met(
-    mesh: trimesh.Trimesh, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
+    mesh: "trimesh.Trimesh", origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n"]:
     """Distance along each ray to the mesh, by Embree; `inf` where a ray misses it."""
+    require("casting rays at meshes", "embreex")
     cast: Any = mesh.ray.intersects_location
     points, rays, _ = cast(origins, directions, multiple_hits=False)
     distance = np.full(len(origins), np.inf)
@@ -188,8 +207,10 @@ def first_met(
     return distance
 
 
-def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
+def outer_surface(soup: "trimesh.Trimesh") -> "trimesh.Trimesh":
     """The faces that have the solid on exactly one side, turned outwards; faces half buried are split first."""
+    import trimesh
+
     kept = []
     triangles = soup.triangles.view(np.ndarray)
     while len(triangles):
@@ -202,12 +223,12 @@ def outer_surface(soup: trimesh.Trimesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
 
 
-def bounding(soup: trimesh.Trimesh) -> Bool[np.ndarray, "faces"]:
+def bounding(soup: "trimesh.Trimesh") -> Bool[np.ndarray, "faces"]:
     """Which faces have the solid on exactly one side, at least in part: neither buried faces nor loose sheets."""
     return _exposure(soup, soup.triangles.view(np.ndarray))[0] > 0
 
 
-def _exposure(soup: trimesh.Trimesh, triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _exposure(soup: "trimesh.Trimesh", triangles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Of each triangle, the share of test points with the solid on one side only, and whether its normal points out."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1)
@@ -244,7 +265,10 @@ def _quartered(triangles: np.ndarray) -> np.ndarray:
     return np.concatenate([np.stack(part, axis=1) for part in parts])
 
 
-def _winding(soup: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+def _winding(soup: "trimesh.Trimesh", points: np.ndarray) -> np.ndarray:
+    require(PURPOSE, "igl")
+    import igl
+
     vertices = np.asarray(soup.vertices, np.float64)
     faces = np.asarray(soup.faces, np.int64)
     return np.asarray(igl.fast_winding_number(vertices, faces, np.ascontiguousarray(points, np.float64)))

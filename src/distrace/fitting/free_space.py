@@ -1,22 +1,24 @@
 """What of a completed mesh its view contradicts: pieces that lie beside the silhouette, or before what was seen."""
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
-from trimesh.graph import connected_component_labels
 
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.fields.base import SDF
 from distrace.mesh import MeshConfig, extract_mesh
 
+if TYPE_CHECKING:
+    import trimesh
+
 MARGIN = 0.03  # of the unit sphere's radius: what is nearer to what was seen does not contradict it
 LEFT_OUT = "left_out"
 
 
-def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> trimesh.Trimesh:
+def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> "trimesh.Trimesh":
     """The surface of a fitted field, less what the view contradicts; a cloud contradicts nothing.
 
     Raises `ValueError` where the field has no zero.
@@ -25,11 +27,13 @@ def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> trimesh.Trime
     return consistent(mesh, seen) if isinstance(seen, View) else mesh
 
 
-def consistent(mesh: trimesh.Trimesh, view: View) -> trimesh.Trimesh:
+def consistent(mesh: "trimesh.Trimesh", view: View) -> "trimesh.Trimesh":
     """The mesh without pieces, connected to nothing else, most of whose area lies where the view shows free space.
 
     The largest piece stays in any case. How many are gone is in the metadata, by the name `left_out`.
     """
+    from trimesh.graph import connected_component_labels
+
     pieces = connected_component_labels(mesh.face_adjacency, node_count=len(mesh.faces))
     whole = np.bincount(pieces, weights=mesh.area_faces)
     free = np.bincount(pieces, weights=mesh.area_faces * free_space(view, mesh.triangles_center))
@@ -46,6 +50,8 @@ def consistent(mesh: trimesh.Trimesh, view: View) -> trimesh.Trimesh:
 
 def free_space(view: View, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Which points the view shows to be in free space: beside the mask, or before a depth, by more than the margin."""
+    from scipy.ndimage import distance_transform_edt
+
     camera = view.camera.to("cpu")
     positions, depths = camera.project(torch.tensor(points, dtype=torch.float32))
     shown = camera.shows(positions, depths)

@@ -1,12 +1,11 @@
 """How noisy depths are, told from the view alone: how far each is from the plane through its neighbours."""
 
 from math import pi, sqrt
+from statistics import NormalDist
 
 import numpy as np
 import torch
 from jaxtyping import Float
-from scipy.spatial import KDTree
-from scipy.stats import norm
 from torch import Tensor
 
 from distrace.data.observation import View
@@ -24,6 +23,8 @@ def noise_of(view: View) -> float:
     Second differences tell the noise of pictures (Immerkær, *Computer Vision and Image Understanding* 1996); here
     neighbours lie anywhere, and quartiles leave edges and outliers aside.
     """
+    from scipy.spatial import KDTree
+
     seen = view.seen.cpu()
     pixels, depths = seen.nonzero().double().numpy(), view.depth.cpu()[seen].double().numpy()
     if len(depths) < LEAST:
@@ -37,7 +38,7 @@ def noise_of(view: View) -> float:
     weights = _of_planes(pixels[near] - pixels[here, None])
     off = depths[here] - (weights * depths[near]).sum(1)
     off /= np.sqrt(1 + np.square(weights).sum(1))  # what the neighbours' own noise adds
-    found = float(np.quantile(np.abs(off), SHARE) / norm.ppf((1 + SHARE) / 2))
+    found = float(np.quantile(np.abs(off), SHARE) / NormalDist().inv_cdf((1 + SHARE) / 2))
     return found if found > TELLING else 0.0
 
 

@@ -4,7 +4,6 @@ from dataclasses import dataclass, fields
 
 import torch
 from jaxtyping import Bool, Float
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from distrace.data.observation import View
@@ -65,6 +64,8 @@ def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "heigh
 
 
 def _outside(inside: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 2"]:
+    from scipy.ndimage import distance_transform_edt
+
     y, x = torch.from_numpy(distance_transform_edt(~inside.cpu().numpy(), return_distances=False, return_indices=True))
     rows, columns = torch.meshgrid(*(torch.arange(size) for size in inside.shape), indexing="ij")
     return torch.stack([columns - x, rows - y], dim=-1).float()

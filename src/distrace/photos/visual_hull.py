@@ -10,7 +10,6 @@ from statistics import mean, median
 
 import torch
 from jaxtyping import Bool, Float, Int
-from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 from torch.nn import functional as F
 
@@ -133,6 +132,8 @@ def _is_solid(
 
 def _distance_field(solid: Bool[Tensor, "cells"]) -> SDF:
     """The signed distance from the solid cells of the finest grid, linear between their centres."""
+    from scipy.ndimage import distance_transform_edt
+
     solid = solid.reshape(CELLS, CELLS, CELLS)
     outside, within = (torch.from_numpy(distance_transform_edt(part.numpy())).float() for part in (~solid, solid))
     grid = ((outside - within) * 2 / CELLS)[None, None]

@@ -4,14 +4,15 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
-
-from matplotlib import rc_context
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
+from typing import TYPE_CHECKING, Any
 
 from distrace.files import written
+from distrace.optional import require
 from distrace.report.page import Html
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 PALETTE = ("#4477aa", "#ee7733", "#228833", "#cc3377", "#8866cc", "#0099aa", "#aa8811", "#888888")
 THEME_INK = "#010203"  # stands in a chart for the colour of the page's text
@@ -55,6 +56,10 @@ def courses(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: 
 
 def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
     """A PNG of values, one for each so many steps, on logarithmic axes."""
+    require("a chart", "matplotlib")
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
     with rc_context({"font.size": 10.5}):
         chart = Figure(figsize=(7.4, 3.6), layout="constrained")
         axes = chart.add_subplot()
@@ -83,17 +88,21 @@ def bars(values: Mapping[str, float], x_label: str) -> Html:
     return _drawn(chart)
 
 
-def _lines(series: Mapping[str, Mapping[Any, float]], **how: Any) -> tuple[Figure, Axes]:
+def _lines(series: Mapping[str, Mapping[Any, float]], **style: Any) -> "tuple[Figure, Axes]":
     """Each series by its x, all named below."""
     chart, axes = _empty("both")
     for i, (name, points) in enumerate(series.items()):
         colour = PALETTE[i % len(PALETTE)]
-        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=colour, **how)
+        axes.plot(list(points), list(points.values()), "o-", label=_plain(name), color=colour, **style)
     chart.legend(loc="outside lower left", ncols=2, frameon=False)
     return chart, axes
 
 
-def _empty(grid: str, height: float = 3.6) -> tuple[Figure, Axes]:
+def _empty(grid: str, height: float = 3.6) -> "tuple[Figure, Axes]":
+    require("a chart", "matplotlib")
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure
+
     with rc_context(STYLE):
         chart = Figure(figsize=(7.4, height), layout="constrained", facecolor="none")
         axes = chart.add_subplot(facecolor="none")
@@ -102,7 +111,9 @@ def _empty(grid: str, height: float = 3.6) -> tuple[Figure, Axes]:
     return chart, axes
 
 
-def _drawn(chart: Figure) -> Html:
+def _drawn(chart: "Figure") -> Html:
+    from matplotlib import rc_context
+
     drawn = io.StringIO()
     with rc_context(STYLE):
         chart.savefig(drawn, format="svg", metadata=dict.fromkeys(("Creator", "Date", "Format", "Type")))

@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float, UInt8
 
 from distrace import shading
@@ -15,6 +15,9 @@ from distrace.report.charts import curves
 from distrace.report.page import Html, figure, key, page, paragraph, ramp, row, section, table
 from distrace.report.scene import scene
 from distrace.shading import Picture
+
+if TYPE_CHECKING:
+    import trimesh
 
 DENSE = 0.05  # the share of pixels with a depth above which dots would hide each other
 
@@ -47,7 +50,7 @@ class Completion:
     after: View
     truth: View | None
     losses: dict[str, list[float]]  # a curve for each start, or for each term
-    mesh: trimesh.Trimesh
+    mesh: "trimesh.Trimesh"
     truth_points: Float[np.ndarray, "m 3"] | None
     chamfer: Chamfer | None
     facts: dict[str, str]

@@ -12,8 +12,6 @@ from typing import NewType
 
 import numpy as np
 from jaxtyping import UInt8
-from PIL import Image
-from plotly.offline import get_plotlyjs
 
 from distrace.shading import Colour, Picture
 
@@ -73,9 +71,11 @@ for (const view of document.querySelectorAll(".scene")) {
 def page(title: str, lead: str, sections: Sequence[Html]) -> str:
     """A whole document. Its policy forbids the browser to load anything; plotly is inside where there is a 3-D view."""
     body = "\n".join(sections)
-    scripts = (
-        f"<script>{get_plotlyjs()}</script>\n<script>{SHOW_SCENES}</script>" if '<div class="scene"' in body else ""
-    )
+    scripts = ""
+    if '<div class="scene"' in body:
+        from plotly.offline import get_plotlyjs
+
+        scripts = f"<script>{get_plotlyjs()}</script>\n<script>{SHOW_SCENES}</script>"
     return f"""<!doctype html>
 <html lang="en">
 <head>
@@ -108,6 +108,8 @@ def paragraph(text: str) -> Html:
 
 def figure(picture: Picture, caption: str) -> Html:
     """A picture with its caption; one of few pixels is shown with its pixels."""
+    from PIL import Image
+
     encoded = io.BytesIO()
     Image.fromarray(picture).save(encoded, format="PNG", optimize=True)
     source = "data:image/png;base64," + base64.b64encode(encoded.getvalue()).decode()

@@ -4,10 +4,10 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import mean
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional as F
@@ -24,6 +24,9 @@ from distrace.report.page import Html, figure, page, paragraph, section, table
 from distrace.report.scene import scene
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 from distrace.training.losses import COURSE
+
+if TYPE_CHECKING:
+    import trimesh
 
 AT_ONCE = 1 << 16  # points whose colours are asked for
 FINER = 2  # rays across a pixel: photographs have means over areas
@@ -75,8 +78,10 @@ def seen(
 
 
 @torch.no_grad()
-def coloured_mesh(state: Reconstruction, config: MeshConfig) -> trimesh.Trimesh:
+def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh":
     """The surface as triangles; each vertex has the colour that it shows when looked at from straight above."""
+    import trimesh
+
     mesh = extract_mesh(state.surface, config)
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float().to(config.device)
     parts = []
@@ -103,7 +108,7 @@ def reconstruction_page(
     held_out: Sequence[Judged],
     told: Sequence[Judged],
     course: Mapping[str, Sequence[float]],
-    mesh: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
     facts: Mapping[str, str],
 ) -> str:
     """Views that were held out, some that were not, the mesh, and the course of the loss."""

@@ -3,15 +3,18 @@
 import math
 from collections.abc import Mapping
 from html import escape
+from typing import TYPE_CHECKING
 
 import numpy as np
-import plotly.graph_objects as go
-import trimesh
 from jaxtyping import Float, Int
-from trimesh.visual import ColorVisuals
 
+from distrace.optional import require
 from distrace.report.charts import PALETTE
 from distrace.report.page import Html
+
+if TYPE_CHECKING:
+    import plotly.graph_objects as go
+    import trimesh
 
 MOST_FACES = 60_000
 MOST_POINTS = 8_000
@@ -21,11 +24,14 @@ ASPECT = 1.5  # a little less than pages have
 MARGIN = 1.08
 
 
-def scene(meshes: Mapping[str, trimesh.Trimesh], clouds: Mapping[str, np.ndarray]) -> Html:
+def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray]) -> Html:
     """A view to turn, y up, in the colours of the meshes' vertices where they have some.
 
     Each name stands in the legend, which hides and shows it.
     """
+    require("a 3-D view", "plotly")
+    import plotly.graph_objects as go
+
     surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
     points = [
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
@@ -57,7 +63,9 @@ def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return (corners @ back + MARGIN * half / np.tan(FIELD_OF_VIEW / 2)).max() * back
 
 
-def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
+def _surface(name: str, mesh: "trimesh.Trimesh") -> "go.Mesh3d":
+    import plotly.graph_objects as go
+
     vertices, faces = _decimated(np.hstack([mesh.vertices, _own_colours(mesh)]), np.asarray(mesh.faces))
     colours = ["#" + colour.tobytes().hex() for colour in vertices[:, 3:].astype(np.uint8)]
     light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
@@ -74,15 +82,19 @@ def _surface(name: str, mesh: trimesh.Trimesh) -> go.Mesh3d:
     )
 
 
-def _own_colours(mesh: trimesh.Trimesh) -> np.ndarray:
+def _own_colours(mesh: "trimesh.Trimesh") -> np.ndarray:
     """Red, green and blue of each vertex; no columns where a mesh has none."""
+    from trimesh.visual import ColorVisuals
+
     visual = mesh.visual
     if isinstance(visual, ColorVisuals) and visual.kind == "vertex":
         return np.asarray(visual.vertex_colors)[:, :3]
     return np.empty((len(mesh.vertices), 0))
 
 
-def _cloud(name: str, points: np.ndarray, colour: str) -> go.Scatter3d:
+def _cloud(name: str, points: np.ndarray, colour: str) -> "go.Scatter3d":
+    import plotly.graph_objects as go
+
     some = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
     dot = dict(size=1.8 if len(some) > 1000 else 4, color=colour)
     return go.Scatter3d(**_coordinates(some), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")

@@ -1,10 +1,10 @@
 """The page of a shape found in photographs: each of them beside what was made of it, and how the shape formed."""
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 from jaxtyping import UInt8
 
 from distrace.camera import Camera
@@ -20,6 +20,9 @@ from distrace.report.page import figure, page, paragraph, row, section, table
 from distrace.report.scene import scene
 from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
 
+if TYPE_CHECKING:
+    import trimesh
+
 SHOWN = 8  # views
 SIZE = 224  # pixels, of pictures
 FRAMES = 24  # of the film of the shape forming
@@ -30,7 +33,7 @@ def views_page(
     views: Sequence[Photograph],
     steps: Sequence[PhotoStep],
     agreed: Sequence[ViewAgreement],
-    mesh: trimesh.Trimesh,
+    mesh: "trimesh.Trimesh",
 ) -> str:
     """Photographs with the outline of the fitted shape, the shape, and what each view is off by."""
     last = steps[-1]

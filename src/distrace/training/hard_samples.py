@@ -3,7 +3,6 @@
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from distrace.checkpoints.model import VARIANT, Model
@@ -34,6 +33,8 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
 @torch.no_grad()
 def _wrong_places(model: Model, name: str, samples: Float[Tensor, "n 4"]) -> Bool[Tensor, "n"]:
     """Which samples lie within REACH of one whose sign the model has wrong."""
+    from scipy.spatial import KDTree
+
     values = model.field(model.code_of(name))(samples[:, :3])
     distances = samples[:, 3]
     wrong = (values * distances < 0) & (distances.abs() > CERTAIN)

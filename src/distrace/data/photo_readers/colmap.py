@@ -12,6 +12,7 @@ from jaxtyping import Float
 from distrace.data.photo_readers.colmap_files import check_whole, with_point_lines
 from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, inside
 from distrace.errors import DoubtfulResult, about, explained
+from distrace.optional import require
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 OBSERVED = 3  # images at least that see a point which is trusted
@@ -49,8 +50,10 @@ def _models(folder: Path) -> list[Path]:
 
 def _reconstruction(model: Path) -> Any:
     """What COLMAP's library reads."""
+    require(f"reading {model}", "pycolmap")
+    from pycolmap import Reconstruction
+
     check_whole(model)
-    from pycolmap import Reconstruction  # here, as loading it takes longer than reading most folders
 
     with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
         images = None if (model / "cameras.bin").is_file() else with_point_lines(model / "images.txt")

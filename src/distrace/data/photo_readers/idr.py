@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy.linalg import rq
 
 from distrace.data.photo_readers.frames import Shot, Shots, images_in, matrix
 from distrace.data.placement import Placement
@@ -66,6 +65,8 @@ def decomposed(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     left = projection[:, :3] * np.sign(np.linalg.det(projection[:, :3]))
     if not np.linalg.cond(left) < 1e12:
         raise ValueError("its left three columns have no inverse; it maps points of the world to pixels")
+    from scipy.linalg import rq
+
     upper, rotation = rq(left)
     signs = np.sign(np.diag(upper))  # the decomposition is unique with a positive diagonal
     upper = upper * signs
