@@ -186,7 +186,7 @@ def test_ctrl_c_in_an_orbit_leaves_the_first_view_and_no_half_movie(
 
     monkeypatch.setattr(distrace.movie, "render", interrupted)
     said = one_line(run, capsys, ("render", model, "--orbit", 3, "--out", tmp_path, *VIEW), status=130)
-    assert "stopped" in said
+    assert "interrupted" in said
     assert names(tmp_path) == {"buffers.npz", "view.npz", "depth.png", "normal.png", "mask.png", "shaded.png"}
 
 
@@ -520,9 +520,9 @@ def test_ctrl_c_ends_in_one_line_and_status_130(
     def interrupted(self: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(distrace.cli.Mesh, "run", interrupted)
+    monkeypatch.setattr(show.Mesh, "run", interrupted)
     said = one_line(run, capsys, ("mesh", model, "--out", tmp_path), status=130)
-    assert "stopped" in said
+    assert "interrupted" in said
 
 
 def test_a_bug_is_not_hidden_behind_one_line(
@@ -531,6 +531,6 @@ def test_a_bug_is_not_hidden_behind_one_line(
     def broken(self: object) -> None:
         raise RuntimeError("mat1 and mat2 shapes cannot be multiplied")
 
-    monkeypatch.setattr(distrace.cli.Mesh, "run", broken)
+    monkeypatch.setattr(show.Mesh, "run", broken)
     with pytest.raises(RuntimeError, match="mat1"):
         run("mesh", model, "--out", tmp_path)

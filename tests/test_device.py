@@ -12,7 +12,7 @@ from test_train import finished, spheres
 import distrace.cli.console
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
-from distrace.cli import _run, multiview, pose
+from distrace.cli import multiview, parsed, pose
 from distrace.data.observation import View
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, save_photographs
@@ -43,7 +43,8 @@ def command(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[Command
     """The command line, where `--device cuda` is the pretended one."""
     monkeypatch.setattr(distrace.cli.console, "chosen_device", lambda name: DEVICE)
     with pretended(monkeypatch):
-        yield lambda *words: _run([str(word) for word in (*words, "--device", "cuda", "--out", tmp_path / "out")])
+        options = ("--device", "cuda", "--out", tmp_path / "out")
+        yield lambda *words: parsed([str(word) for word in (*words, *options)]).run()
     torch.set_flush_denormal(False)
 
 

@@ -7,7 +7,8 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("threads", "optional", "errors", "files", "processes", "equality", "pixels", "rays", "viewpoint", "camera", "pose"),
+    *("threads", "optional", "errors", "files", "processes", "equality", "pixels"),
+    *("rays", "viewpoint", "camera", "pose"),
     *("fields", "checkpoints", "prior"),
     *("tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),

@@ -507,7 +507,7 @@ def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytes
     before = checkpoint(out)
     capsys.readouterr()
     run("train", samples, "--out", out, "--steps", "3")
-    assert "going on from step 3 of 3" in capsys.readouterr().out
+    assert "continuing from step 3 of 3" in capsys.readouterr().out
     assert_same_state(before["decoder"], checkpoint(out)["decoder"])
     assert json.loads((out / "result.json").read_text())["loss"] == before["losses"][-1]
 

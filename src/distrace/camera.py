@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from numbers import Integral
 
 import torch
 from jaxtyping import Bool, Float
@@ -224,8 +225,8 @@ class Camera(ByValue):
 
 
 def _check_size(height: int, width: int) -> None:
-    if height < 1 or width < 1:
-        raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be at least 1")
+    if not all(isinstance(size, Integral) and size >= 1 for size in (height, width)):
+        raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be whole numbers from 1")
 
 
 def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:

@@ -1,79 +1,135 @@
-"""The command line. Each command writes to `--out`; whatever goes wrong is one line on stderr and exit status 2."""
+"""The command line. Each command writes to `--out`; an error is one line on stderr and exit status 2."""
 
 import io
+import os
 import re
 import sys
 from collections.abc import Mapping
 from contextlib import redirect_stderr
+from dataclasses import dataclass, make_dataclass
+from importlib import import_module
+from importlib.metadata import version
+from typing import Any
 
-import torch
-import tyro
+from distrace.optional import MissingLibrary
 
-from distrace.cli.bench import Bench
-from distrace.cli.complete import Complete, Demo
-from distrace.cli.console import errors
-from distrace.cli.data import Data, Sample
-from distrace.cli.gradients import CheckGradients
-from distrace.cli.multiview import Multiview
-from distrace.cli.pose import Pose
-from distrace.cli.reconstruct import Reconstruct
-from distrace.cli.show import Mesh, Render
-from distrace.cli.train import Train
 
-COMMANDS = {
-    "demo": Demo,
-    "render": Render,
-    "mesh": Mesh,
-    "complete": Complete,
-    "pose": Pose,
-    "multiview": Multiview,
-    "reconstruct": Reconstruct,
-    "data": Data,
-    "sample": Sample,
-    "train": Train,
-    "bench": Bench,
-    "check-gradients": CheckGradients,
+@dataclass(frozen=True)
+class Lazy:
+    """A command whose module is imported when it runs; `summary` is the first sentence of its docstring."""
+
+    module: str
+    name: str
+    summary: str
+
+    def loaded(self) -> type:
+        """Returns the command."""
+        return getattr(import_module(self.module), self.name)
+
+    def listed(self) -> type:
+        """Returns a command without options, for the list of commands."""
+        return make_dataclass(self.name, (), namespace={"__doc__": self.summary})
+
+
+Commands = Mapping[str, Lazy | type]
+
+COMMANDS: Commands = {
+    "demo": Lazy(
+        "distrace.cli.complete", "Demo", "Complete the bundled sofa, held out of training, from 100 depths and a mask."
+    ),
+    "render": Lazy("distrace.cli.show", "Render", "Render one view: depth, normals, mask and a shaded picture."),
+    "mesh": Lazy("distrace.cli.show", "Mesh", "Extract a mesh by marching cubes."),
+    "complete": Lazy("distrace.cli.complete", "Complete", "Complete a shape from one depth view or a point cloud."),
+    "pose": Lazy("distrace.cli.pose", "Pose", "Find the camera of one view of a known shape."),
+    "multiview": Lazy(
+        "distrace.cli.multiview", "Multiview", "Find a shape and its placement from photographs with known cameras."
+    ),
+    "reconstruct": Lazy(
+        "distrace.cli.reconstruct", "Reconstruct", "Reconstruct any object from photographs with known cameras."
+    ),
+    "data": Lazy("distrace.cli.data", "Data", "Fetch a source of meshes, and list each with its creator and licence."),
+    "sample": Lazy("distrace.cli.data", "Sample", "Turn meshes into signed samples in DeepSDF's .npz."),
+    "train": Lazy("distrace.cli.train", "Train", "Train a DeepSDF decoder and the codes of its shapes."),
+    "bench": Lazy("distrace.cli.bench", "Bench", "Measure the tracer's cost and error against a cautious reference."),
+    "check-gradients": Lazy(
+        "distrace.cli.gradients", "CheckGradients", "Compare every derivative of an image with finite differences."
+    ),
 }
 
-ABOUT = "Render neural signed distance functions, and fit them to what was observed. Results go to the folder --out."
+ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
+RUNNING = "interrupted; every written file is complete, and sample, train and reconstruct continue when run again"
 
 
 def main() -> None:
     run_commands(COMMANDS, "distrace", ABOUT)
 
 
-def run_commands(commands: Mapping[str, type], program: str, about: str) -> None:
-    """Does what the command line says; ends the process where that fails."""
+def run_commands(commands: Commands, program: str, about: str) -> None:
+    """Runs what the command line says; exits the process where that fails."""
     sys.argv[0] = program  # as recorded tables name it
+    _print_any_character()
+    interrupted = "interrupted"
     try:
-        _run(sys.argv[1:], commands, program, about)
+        command = parsed(sys.argv[1:], commands, program, about)
+        interrupted = RUNNING
+        command.run()
+        sys.stdout.flush()
     except KeyboardInterrupt:
-        _end(program, "stopped; what is written is whole, and what takes long goes on from there", 130)
-    except (ValueError, OSError) as error:
+        _end(program, interrupted, 130)
+    except BrokenPipeError:
+        discard_output()
+    except (ValueError, OSError, MissingLibrary) as error:
         _end(program, str(error), 2)
     except (MemoryError, RuntimeError) as error:
-        if not isinstance(error, MemoryError | torch.OutOfMemoryError) and "allocate memory" not in str(error):
+        if not _out_of_memory(error):
             raise
-        _end(program, "there is not enough memory for that; use a smaller size, or --device cpu", 2)
+        _end(program, "not enough memory; use a smaller size, or --device cpu", 2)
 
 
-def _run(
-    arguments: list[str], commands: Mapping[str, type] = COMMANDS, program: str = "distrace", about: str = ABOUT
-) -> None:
-    said = io.StringIO()
+def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "distrace", about: str = ABOUT) -> Any:
+    """Returns the command with its options. Raises `ValueError` for arguments that cannot be parsed."""
+    import tyro
+
+    if arguments == ["--version"]:
+        print(program, version("distrace"), flush=True)
+        sys.exit()
+    message = io.StringIO()
     try:
-        with redirect_stderr(said):
-            command = tyro.extras.subcommand_cli_from_dict(
-                dict(commands), args=arguments, prog=program, description=about
-            )
+        with redirect_stderr(message):
+            if arguments and arguments[0] in commands:
+                name, *options = arguments
+                chosen = commands[name]
+                kind = chosen.loaded() if isinstance(chosen, Lazy) else chosen
+                command = tyro.cli(kind, args=options, prog=f"{program} {name}")
+            else:
+                kinds = {name: each.listed() if isinstance(each, Lazy) else each for name, each in commands.items()}
+                command = tyro.extras.subcommand_cli_from_dict(kinds, args=arguments, prog=program, description=about)
     except SystemExit as stop:
         if stop.code:
-            raise ValueError(_one_line(said.getvalue())) from None
+            raise ValueError(_one_line(message.getvalue())) from None
+        sys.stdout.flush()
         raise
     seed = getattr(command, "seed", None)
     if seed is not None and not 0 <= seed < 2**31:
         raise ValueError(f"--seed {seed} was given; a number from 0 to {2**31 - 1} is needed")
-    command.run()
+    return command
+
+
+def discard_output() -> None:
+    """Sends what is still printed nowhere, for the process that read it is gone."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _print_any_character() -> None:
+    """Replaces characters that the output's encoding lacks, instead of failing at them."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")
+
+
+def _out_of_memory(error: Exception) -> bool:
+    import torch
+
+    return isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate memory" in str(error)
 
 
 def _one_line(box: str) -> str:
@@ -83,5 +139,5 @@ def _one_line(box: str) -> str:
 
 
 def _end(program: str, sentence: str, status: int) -> None:
-    errors.print(f"{program}: {' '.join(sentence.split())}", markup=False, highlight=False)
+    print(f"{program}: {' '.join(sentence.split())}", file=sys.stderr)
     sys.exit(status)

@@ -9,12 +9,12 @@ from distrace.benchmarks.agreement_page import agreement_page, worst_picture
 from distrace.benchmarks.random_views import View, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
-from distrace.cli.console import Run, console, origin, progress
+from distrace.cli.console import Run, origin, progress
 from distrace.files import save_text
 from distrace.render import STRATEGIES
 from distrace.shading import save_png
 
-SHOWN = 10  # of the worst views
+SHOWN = 10  # the worst views on the page
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,13 @@ def bench_views(run: Run, plan: Plan) -> None:
             worst = sorted([*worst, measured], key=badness, reverse=True)[:SHOWN]  # frees the other images
             seconds = measured.row.seconds + measured.row.reference_seconds
             bar.advance(f"{view.model}: IoU {measured.row.iou:.4f}, {seconds:.1f} s")
-    found = summaries(rows)
+    lines = summaries(rows)
     save_png(run.out / "worst.png", worst_picture(worst))
-    save_text(run.out / "index.html", agreement_page(strategy, plan.seed, found, rows, worst))
-    show_table([asdict(line) for line in found])
-    console.print(f"{sum(not row.fails for row in rows)} of {len(rows)} views pass")
+    with run.optional("index.html"):
+        save_text(run.out / "index.html", agreement_page(strategy, plan.seed, lines, rows, worst))
+    show_table([asdict(line) for line in lines])
     evaluations = {name: sum(getattr(row, name) for row in rows) for name in ("evaluations", "setup_evaluations")}
     facts = {"strategy": strategy, "seed": plan.seed, "views": plan.views, "sizes": list(plan.sizes)}
-    content = {"rows": [asdict(row) for row in rows], "summary": [asdict(line) for line in found]}
-    run.finish({**content, **facts, **origin(), **evaluations})
+    content = {"rows": [asdict(row) for row in rows], "summary": [asdict(line) for line in lines]}
+    passed = sum(not row.fails for row in rows)
+    run.finish({**content, **facts, **origin(), **evaluations}, f"{passed} of {len(rows)} views pass")

@@ -1,12 +1,11 @@
-"""Pieces of several commands: opening a model, and the files that a rendering leaves."""
+"""What several commands share: loading a model, and writing what was rendered."""
 
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import torch
-import trimesh
 import tyro
 
 from distrace import shading
@@ -17,6 +16,9 @@ from distrace.files import save_arrays, written
 from distrace.render import Buffers
 from distrace.report.completion_page import View
 from distrace.report.page import short
+
+if TYPE_CHECKING:
+    import trimesh
 
 ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
 Views = Annotated[
@@ -29,27 +31,42 @@ Views = Annotated[
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
 
+def default(value: object, metavar: str | None = None) -> Any:
+    """Annotates an option that is None unless given; `--help` shows what it then means."""
+    return tyro.conf.arg(metavar=metavar or type(value).__name__.upper(), help_behavior_hint=f"(default: {value})")
+
+
 class Every:
-    """Tells when it is time to save: seconds since it last did. Raises `ValueError` for a time that never passes."""
+    """A timer that says when to save. Raises `ValueError` for a time that never passes."""
 
     def __init__(self, seconds: float) -> None:
         if not seconds >= 0:
             raise ValueError(f"--save-every {seconds} was given; give seconds, at least 0")
-        self.seconds, self.last = seconds, time.perf_counter()
+        self.seconds = seconds
+        self.last = time.perf_counter()
 
     def passed(self) -> bool:
-        """Whether they have; if so, they count anew."""
-        over = time.perf_counter() - self.last > self.seconds
-        self.last = time.perf_counter() if over else self.last
-        return over
+        """Returns whether the time has passed; if so, starts again."""
+        now = time.perf_counter()
+        if now - self.last <= self.seconds:
+            return False
+        self.last = now
+        return True
 
 
 def opened(name: str, device: torch.device) -> Model:
     return load_model(name).to(device)
 
 
+def check_distance(distance: float | None) -> None:
+    """Raises `ValueError` for a negative distance, which would put the camera behind the origin."""
+    if distance is not None and distance < 0:
+        raise ValueError(f"--distance {distance} was given; it cannot be negative")
+
+
 def orbiting(view: Any) -> Camera:
-    """The camera that a command's own words put around the shape."""
+    """Returns the camera of a command's options. Raises `ValueError` where one is out of range."""
+    check_distance(view.distance)
     return Camera.orbit(
         view.azimuth,
         view.elevation,
@@ -80,13 +97,13 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
     save_arrays(path, arrays)
 
 
-def save_mesh(path: Path, mesh: trimesh.Trimesh) -> None:
+def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
     with written(path) as file:
         mesh.export(file, file_type="ply")
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:
-    """Prints rows in full, however narrow the terminal is; what a row has not stays empty."""
+    """Prints rows in full, however narrow the terminal is; a value that a row lacks stays empty."""
     names = list(dict.fromkeys(name for row in rows for name in row))
     columns: list[list[str]] = []
     for name in names:
@@ -96,4 +113,4 @@ def show_table(rows: Sequence[Mapping[str, object]]) -> None:
         columns.append([cell.rjust(width) if numeric else cell.ljust(width) for cell in column])
     for number, line in enumerate(zip(*columns)):
         style = "" if number else "bold"
-        console.print(" ".join(line).rstrip(), style=style, soft_wrap=True, markup=False, highlight=False)
+        console.print(" ".join(line).rstrip(), style=style, soft_wrap=True, highlight=False)

@@ -3,14 +3,13 @@
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
-import trimesh
 import tyro
 
-from distrace.cli.common import ModelName, opened
-from distrace.cli.completion import Surface, Task, complete
+from distrace.cli.common import ModelName, default, opened
+from distrace.cli.completion import Task, complete
 from distrace.cli.console import console, start
 from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.observation import View, load_view
@@ -20,26 +19,33 @@ from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
 from distrace.mesh import MeshConfig
 
+if TYPE_CHECKING:
+    import trimesh
+
 OBSERVATIONS = files("distrace") / "observations"
 DEMO_POINTS = 100
 
 
 @dataclass(frozen=True)
 class Complete:
-    """Complete a shape from one depth view, or from points of its surface: mesh, code, and a page that shows how."""
+    """Complete a shape from one depth view or a point cloud.
+
+    Writes the mesh, the code, and a page that compares them with the observation.
+    """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]  # or POINTS.ply
     out: Path = Path("out/complete")
-    reference: Path | None = None  # the true surface, to measure against: a mesh or points (PLY)
-    points: int | None = None  # use only so many of the depths or points, drawn at random
-    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts to leave out; a view's normals tell adam alone
-    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or Adam as in the original; points have lm alone
-    iterations: int | None = None  # by default 16 of Levenberg–Marquardt, or 150 of Adam
-    starts: int = FitConfig.starts
-    plausible: int = 0  # so many other completions that fit, too, and how far they are apart
+    reference: Annotated[Path | None, default("none", "PLY")] = None
+    """true surface to measure against: a mesh or points (PLY)"""
+    points: Annotated[int | None, default("all", "INT")] = None  # number of depths or points to use, drawn at random
+    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts to ignore; only adam uses a view's normals
+    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or Adam as in DIST; clouds need lm
+    iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None
+    starts: int = FitConfig.starts  # of the multi-start fit
+    plausible: int = 0  # number of other completions that also fit
     seed: int = 0
-    resolution: int = 128  # of the mesh: wings and rods thinner than its cells, a 64th, are torn; 256 keeps them
+    resolution: int = 128  # cells along each side of the mesh's grid; 256 keeps parts thinner than 1/64 whole
     device: str = "cpu"
 
     def run(self) -> None:
@@ -69,7 +75,7 @@ class Complete:
 
 @dataclass(frozen=True)
 class Demo:
-    """Complete the bundled sofa, which the bundled model never saw, from 100 depths and its silhouette."""
+    """Complete the bundled sofa, held out of training, from 100 depths and a mask."""
 
     out: Path = Path("out/demo")
     seed: int = 0
@@ -80,18 +86,22 @@ class Demo:
         (name,) = (Path(item.name).stem for item in OBSERVATIONS.iterdir() if item.name.endswith(".npz"))
         full = load_view(Path(str(OBSERVATIONS / f"{name}.npz")))
         truth = _reference(Path(str(OBSERVATIONS / f"{name}.ply")))
-        console.print(f"completing [bold]{name}[/bold] from {DEMO_POINTS} depths and its silhouette")
+        console.print(f"completing {name} from {DEMO_POINTS} depths and its silhouette")
         known = full.sparse(DEMO_POINTS, self.seed).without("normal")
-        fit, mesh = CodeFitConfig(seed=self.seed), MeshConfig(128, device=run.device)
+        fit = CodeFitConfig(seed=self.seed)
+        mesh = MeshConfig(128, device=run.device)
         complete(run, Task(opened("sofas", run.device), full, known, truth, fit, mesh))
 
 
-def _reference(path: Path) -> Surface:
+def _reference(path: Path) -> "trimesh.Trimesh | np.ndarray":
+    import trimesh
+
     with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
         loaded = load_geometry(path)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
-        vertices, faces = np.asarray(loaded.vertices, dtype=np.float64), getattr(loaded, "faces", ())
+        vertices = np.asarray(loaded.vertices, dtype=np.float64)
+        faces = getattr(loaded, "faces", ())
         if not len(vertices) or not np.isfinite(vertices).all():
             raise ValueError("it has no points, or some that are not finite")
         if len(faces) and not loaded.area > 0:

@@ -1,21 +1,21 @@
-"""A completion as a command runs it: fitted, meshed, measured, and shown on a page."""
+"""A completion as a command runs it: the fit, the mesh, the distance to the truth, and the page."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 
 from distrace import shading
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.cli.common import save_mesh
-from distrace.cli.console import Run, console, progress
+from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
-from distrace.files import written
+from distrace.files import save_text, written
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.free_space import LEFT_OUT, completed
@@ -28,43 +28,45 @@ from distrace.prior import prior_of
 from distrace.render import render
 from distrace.report import completion_page as report
 
-Surface = trimesh.Trimesh | np.ndarray
-CLOUD_SIZE = 256  # pixels of the pictures of a cloud's completion
-SMALL = 144  # pixels, of pictures of which there are many
-SPREAD = 0.1  # that is drawn in the fullest colour
+if TYPE_CHECKING:
+    import trimesh
+
+CLOUD_SIZE = 256  # pixels along each side of the pictures of a cloud's completion
+SMALL = 144  # pixels along each side of the pictures of other completions
+SPREAD = 0.1  # distance between completions that is drawn in the fullest colour
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is to be completed, and how."""
+    """An observation to complete, and the settings."""
 
     model: Model
-    full: View | Cloud  # all that was observed
-    known: View | Cloud  # what may be used of it
-    truth: Surface | None
+    full: View | Cloud  # the whole observation
+    known: View | Cloud  # the part that the fit may use
+    truth: "trimesh.Trimesh | np.ndarray | None"
     fit: FitConfig | CodeFitConfig
     mesh: MeshConfig
-    plausible: int = 0  # other completions
+    plausible: int = 0  # number of other completions
 
     @property
     def camera(self) -> Camera:
-        """That of the view; clouds are shown from in front and above."""
+        """Returns the view's camera; clouds are shown from above and in front."""
         return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
 
-    def surface(self, step: Step) -> trimesh.Trimesh:
+    def surface(self, step: Step) -> "trimesh.Trimesh":
         return completed(self.model.field(step.code), self.known, self.mesh)
 
-    def shown(self, seen: View | Cloud) -> View:
-        return seen.seen_from(self.camera) if isinstance(seen, Cloud) else seen
+    def shown(self, observation: View | Cloud) -> View:
+        return observation.seen_from(self.camera) if isinstance(observation, Cloud) else observation
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """A fit, and everything that it took."""
+    """The steps of a fit, and its results."""
 
     steps: list[Step]
     others: list[Step]
-    mesh: trimesh.Trimesh
+    mesh: "trimesh.Trimesh"
     chamfer: Chamfer | None
 
     @property
@@ -82,16 +84,17 @@ def complete(run: Run, task: Task) -> None:
     save_mesh(run.out / "mesh.ply", outcome.mesh)
     for step in outcome.others:
         save_mesh(run.out / f"plausible-{step.start + 1}.ply", task.surface(step))
-    page = _story(task, outcome)
-    shading.save_png(run.out / "shaded.png", page.after.shaded)
-    with written(run.out / "report.html") as file:
-        file.write(report.completion_page(page).encode())
+    content = _page_content(task, outcome)
+    shading.save_png(run.out / "shaded.png", content.after.shaded)
+    with run.optional("report.html"):
+        save_text(run.out / "report.html", report.completion_page(content))
     facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
-    distances = outcome.chamfer
-    if distances:
-        console.print(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
+    lines = []
+    if outcome.chamfer:
+        distances = outcome.chamfer
+        lines = [f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"]
         facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
-    run.finish(facts)
+    run.finish(facts, *lines)
 
 
 def _fitted(task: Task) -> list[Step]:
@@ -104,7 +107,7 @@ def _fitted(task: Task) -> list[Step]:
 
 
 def _outcome(task: Task, steps: list[Step]) -> Outcome:
-    """The surface, and what else fits. Raises `ValueError` for a field without a zero."""
+    """Returns the surface and the other completions. Raises `ValueError` for a field without a zero."""
     others = list(_others(task))
     mesh = task.surface(steps[-1])
     if others and len(mesh.faces):
@@ -122,12 +125,14 @@ def _others(task: Task) -> Iterator[Step]:
                 bar.advance(f"loss {step.loss:.4f}")
 
 
-def _story(task: Task, outcome: Outcome) -> report.Completion:
-    """All that the page shows."""
-    known, full, truth, last = task.shown(task.known), task.shown(task.full), task.truth, outcome.steps[-1]
+def _page_content(task: Task, outcome: Outcome) -> report.Completion:
+    """Returns everything that the page shows."""
+    known = task.shown(task.known)
+    full = task.shown(task.full)
+    last = outcome.steps[-1]
     distinct: dict[tuple[int, int], Step] = {}
     for step in outcome.steps:
-        distinct.setdefault((step.start, step.iteration), step)  # the result is given again
+        distinct.setdefault((step.start, step.iteration), step)  # the last step repeats the best one
     losses: dict[str, list[float]] = {}
     for step in distinct.values():
         name = "outline" if "outline" in step.terms else step.name
@@ -140,7 +145,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
     facts = {
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
-        "pieces left out of the mesh, where the view shows nothing": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
+        "pieces removed from the mesh, where the view shows free space": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
         "iterations": str(task.fit),
         "evaluations of the network": f"{outcome.evaluations:,}",
         "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
@@ -157,7 +162,7 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
         others=_other_pictures(task, outcome) if outcome.others else [],
         losses=losses,
         mesh=outcome.mesh,
-        truth_points=truth.vertices if isinstance(truth, trimesh.Trimesh) else truth,
+        truth_points=getattr(task.truth, "vertices", task.truth),
         chamfer=outcome.chamfer,
         facts=facts,
         chosen=outcome.steps[-1].name,
@@ -166,21 +171,23 @@ def _story(task: Task, outcome: Outcome) -> report.Completion:
 
 @torch.no_grad()
 def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]:
-    """From the camera and from behind: how far the others are from the completed surface, and each of them."""
+    """Returns two rows, from the camera and from behind: the spread of all completions, then each other one."""
     camera = task.camera.to(task.mesh.device)
-    camera, model, codes = camera.resized(SMALL / camera.height), task.model, [step.code for step in outcome.others]
+    camera = camera.resized(SMALL / camera.height)
+    model = task.model
+    codes = [step.code for step in outcome.others]
     rows = []
     for eye in (camera, camera.turned(180.0)):
         buffers = render(model.field(outcome.steps[-1].code), eye)
-        apart = torch.full_like(buffers.depth, torch.nan)
-        apart[buffers.mask] = spread(model, codes, buffers.points)
-        others = [report.View.of(render(model.field(code), eye)).shaded for code in codes]
-        rows.append([shading.error_picture(apart.cpu().numpy(), SPREAD), *others])
+        distance = torch.full_like(buffers.depth, torch.nan)
+        distance[buffers.mask] = spread(model, codes, buffers.points)
+        pictures = [report.View.of(render(model.field(code), eye)).shaded for code in codes]
+        rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows
 
 
 def _truth_view(full: View) -> report.View | None:
-    """What the observation holds beyond what was used, where it holds all of it."""
+    """Returns the whole observation, or None where a part of it is missing."""
     if full.mask is None or full.normal is None or full.shaded is None:
         return None
     return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)

@@ -1,4 +1,4 @@
-"""What all commands share: progress, devices, and the result that each leaves behind."""
+"""What all commands share: progress, devices, and the result that each writes."""
 
 import sys
 import time
@@ -22,51 +22,82 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+from distrace.cli import discard_output
 from distrace.errors import DoubtfulResult, explained
 from distrace.files import save_json
+from distrace.optional import MissingLibrary
 
-console = Console()
-errors = Console(stderr=True, soft_wrap=True)
 QUIET = 20.0  # seconds between lines where the output is no terminal
+
+
+class Output(Console):
+    """The standard output. Text is printed as it is: names of files may look like markup."""
+
+    def __init__(self) -> None:
+        super().__init__(markup=False, emoji=False)
+
+    def on_broken_pipe(self) -> None:
+        """Goes on without printing: the command still writes its files."""
+        self.quiet = True
+        discard_output()
+
+
+console = Output()
 
 
 @dataclass
 class Run:
-    """One command at work: where it writes, since when, on what."""
+    """One command at work: its folder, its device and its start."""
 
     out: Path
     device: torch.device
     began: float = field(default_factory=time.perf_counter)
-    warnings: list[str] = field(default_factory=list)  # sentences of DoubtfulResult
+    warnings: list[str] = field(default_factory=list)  # sentences
+
+    def warn(self, sentence: str) -> None:
+        """Prints a sentence on stderr, once, and keeps it for `result.json`."""
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+            print(f"distrace: warning: {sentence}", file=sys.stderr)
 
     @contextmanager
     def noticing(self) -> Iterator[None]:
-        """Says each `DoubtfulResult` in one line on stderr, and keeps it. Other warnings are shown as ever."""
+        """Warns of each `DoubtfulResult` in one line. Other warnings are shown as usual."""
         with warnings.catch_warnings():
             warnings.simplefilter("always", DoubtfulResult)
             show = warnings.showwarning
 
             def notice(message: Warning | str, category: type[Warning], *where: Any) -> None:
-                if not issubclass(category, DoubtfulResult):
+                if issubclass(category, DoubtfulResult):
+                    self.warn(str(message))
+                else:
                     show(message, category, *where)
-                elif str(message) not in self.warnings:
-                    self.warnings.append(str(message))
-                    errors.print(f"distrace: warning: {message}", markup=False, highlight=False)
 
             warnings.showwarning = notice
             yield
 
-    def finish(self, facts: dict[str, Any]) -> None:
-        """Writes `result.json` and says where everything is."""
+    @contextmanager
+    def optional(self, name: str) -> Iterator[None]:
+        """Lets a command finish without a file whose library is not installed; a warning says so."""
+        try:
+            yield
+        except MissingLibrary as error:
+            self.warn(f"{name} is left out: {error}")
+
+    def finish(self, facts: dict[str, Any], *lines: str) -> None:
+        """Writes `result.json`, then prints lines and the folder."""
         common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
         if "evaluations" in facts:
             common["setup_evaluations"] = 0  # unless facts say otherwise
-        save_json(self.out / "result.json", {**common, "version": version("distrace"), **facts})
-        console.print(f"wrote [bold]{self.out}[/bold] in {common['seconds']:.1f} s")
+        content = {**common, "version": version("distrace"), "warnings": self.warnings, **facts}
+        save_json(self.out / "result.json", content)
+        for line in lines:
+            console.print(line)
+        console.print(f"wrote {self.out} in {common['seconds']:.1f} s", soft_wrap=True)
 
 
 def start(out: Path, device: str = "cpu") -> Run:
-    """Makes the folder. Raises `ValueError` for an `--out` that is a file, or a device that is not there."""
+    """Makes the folder. Raises `ValueError` for an `--out` that is a file, or an unavailable device."""
     for path in (out, *out.parents):
         if path.exists() and not path.is_dir():
             raise ValueError(f"--out {out} cannot be a folder, for {path} is a file; give another to write to")
@@ -75,12 +106,11 @@ def start(out: Path, device: str = "cpu") -> Run:
 
 
 def chosen_device(name: str) -> torch.device:
+    """Returns the device of a name; `auto` is CUDA where there is one. Raises `ValueError` for any other device."""
     if name == "auto":
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():
-        raise ValueError(
-            f"--device {name} was asked for, but this machine or this build of PyTorch has no CUDA; use cpu"
-        )
+        raise ValueError(f"--device {name} was given, but this machine or this build of PyTorch has no CUDA; use cpu")
     with explained(f"--device {name} is no device; use auto, cpu or cuda"):
         device = torch.device(name)
     if device.type not in ("cpu", "cuda"):
@@ -94,15 +124,15 @@ def device_name(device: torch.device) -> str:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator["Bar"]:
-    """A bar with the time left, and a few words that change as it goes on."""
+    """A bar with the remaining time, and a few words that change with each step."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeElapsedColumn(),
         TextColumn("left"),
         TimeRemainingColumn(),
-        TextColumn("{task.fields[words]}"),
+        TextColumn("{task.fields[words]}", markup=False),
     )
     with Progress(*columns, console=console) as bars:
         yield Bar(bars, bars.add_task(description, total=total, words=""))
@@ -110,25 +140,26 @@ def progress(description: str, total: int) -> Iterator["Bar"]:
 
 @dataclass
 class Bar:
-    """A line of progress; where the output is no terminal, a line now and then."""
+    """A bar of progress in a terminal; elsewhere a line every `QUIET` seconds."""
 
     bars: Progress
     task: TaskID
-    said: float = field(default_factory=time.monotonic)
+    printed: float = field(default_factory=time.monotonic)
 
     def advance(self, words: str = "", to: int | None = None) -> None:
+        """Moves the bar by one step, or to a step."""
         if to is None:
             self.bars.update(self.task, advance=1, words=words)
         else:
             self.bars.update(self.task, completed=to, words=words)
-        if not console.is_terminal and time.monotonic() - self.said > QUIET:
+        if not console.is_terminal and time.monotonic() - self.printed > QUIET:
             task = self.bars.tasks[self.task]
-            console.print(f"{task.description} {task.completed:.0f}/{task.total:.0f} {words}", markup=False)
-            self.said = time.monotonic()
+            console.print(f"{task.description} {task.completed:.0f}/{task.total:.0f} {words}")
+            self.printed = time.monotonic()
 
 
 def machine() -> str:
-    """Processor and library versions, for recorded tables."""
+    """Returns the processor and PyTorch's version, for recorded tables."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
     name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
@@ -136,5 +167,5 @@ def machine() -> str:
 
 
 def origin() -> dict[str, str]:
-    """What a recorded table was made by, and on."""
+    """Returns the command line and the machine, for recorded tables."""
     return {"command": " ".join(sys.argv), "machine": machine()}

@@ -7,46 +7,50 @@ from typing import Annotated, Literal
 
 import tyro
 
-from distrace.cli.common import Flag
+from distrace.cli.common import Flag, default
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
 from distrace.data.catalogue import summary
 from distrace.data.samples import Doubt
 from distrace.data.shapes import every_mesh, read_split
+from distrace.optional import require
 
 PREPARED = {"furniture": furniture.prepare, "planes": planes.prepare, "parked-planes": planes.prepare_parked}
 
 
 @dataclass(frozen=True)
 class Data:
-    """Fetch a source of meshes, unpack it, and list every mesh with its creator and licence."""
+    """Fetch a source of meshes, and list each with its creator and licence."""
 
     name: tyro.conf.Positional[Literal["furniture", "planes", "parked-planes"]]
     """furniture: Debian's sweethome3d-furniture; planes: the aircraft of its flightgear-data-ai; parked-planes: those
     at the airports of its flightgear-data-base, of 1.3 GB"""
-    out: Path | None = None  # by default out/furniture and so on
-    source: Annotated[Path | None, tyro.conf.arg(name="from")] = None  # the .deb, where apt-get is not at hand
+    out: Annotated[Path | None, default("out/NAME", "PATH")] = None
+    source: Annotated[Path | None, default("fetched by apt-get", "DEB"), tyro.conf.arg(name="from")] = None
 
     def run(self) -> None:
         run = start(self.out or Path("out") / self.name)
         meshes = PREPARED[self.name](run.out, self.source)
-        console.print(summary(meshes), markup=False)
+        lines = [summary(meshes)]
         if self.name == "furniture":
-            console.print(f"{furniture.left_out(run.out)} models in other formats are left out")
-        run.finish({"source": self.name, "meshes": len(meshes)})
+            lines.append(f"{furniture.left_out(run.out)} models in other formats are left out")
+        run.finish({"source": self.name, "meshes": len(meshes)}, *lines)
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Turn meshes, watertight or not, into signed samples in DeepSDF's .npz; goes on where it was stopped."""
+    """Turn meshes into signed samples in DeepSDF's .npz.
+
+    Meshes need not be watertight. A run that was interrupted continues when run again.
+    """
 
     meshes: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="MESHES")]]  # a folder, as `data` makes it
     out: Path = Path("out/samples")
-    split: Path | None = None  # a CSV file that lists shapes; without one, every mesh below the folder
+    split: Annotated[Path | None, default("every mesh", "CSV")] = None  # file that lists shapes
     count: int = 500_000  # samples of each shape
-    mirror: Flag = False  # also the mirror image of training shapes that have another
-    variants: int = 0  # also so many copies of each training shape, warped at random
-    workers: int = os.cpu_count() or 1
+    mirror: Flag = False  # also sample mirror images of training shapes that are not symmetric
+    variants: int = 0  # number of randomly warped copies of each training shape
+    workers: int = os.cpu_count() or 1  # processes
 
     def run(self) -> None:
         run = start(self.out)
@@ -58,20 +62,21 @@ class Sample:
             given = f"--count {self.count} --workers {self.workers} --variants {self.variants}"
             raise ValueError(f"{given} was given; at least 1000, 1 and 0 are needed")
         shapes = read_split(self.split) if self.split else every_mesh(self.meshes)
-        todo = sampling.jobs(shapes, self.meshes, self.out, self.count, self.mirror, self.variants)
-        reports = sampled(todo, self.workers)
+        jobs = sampling.jobs(shapes, self.meshes, self.out, self.count, self.mirror, self.variants)
+        reports = sampled(jobs, self.workers)
         rows = [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
         usable = sum(report.usable for report in reports)
         run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows, **origin()})
 
 
-def sampled(todo: list[sampling.Job], workers: int) -> list[Doubt]:
-    """Does the jobs, and says which shapes are left out and why."""
+def sampled(jobs: list[sampling.Job], workers: int) -> list[Doubt]:
+    """Runs the jobs; prints which shapes are left out and why."""
+    require("sampling meshes", "igl", "embreex")
     reports: list[Doubt] = []
-    with progress("sampling", len(todo)) as bar:
-        for report in sampling.run(todo, workers):
+    with progress("sampling", len(jobs)) as bar:
+        for report in sampling.run(jobs, workers):
             reports.append(report)
             bar.advance(report.name)
             if not report.usable:
-                console.print(f"left out {report.name}: {report.reason}", markup=False)
+                console.print(f"left out {report.name}: {report.reason}")
     return reports

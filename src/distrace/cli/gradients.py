@@ -8,19 +8,22 @@ import tyro
 
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, GradientRow, check_gradients
 from distrace.cli.common import ModelName, opened, orbiting, show_table
-from distrace.cli.console import console, origin, start
+from distrace.cli.console import origin, start
 
 
 @dataclass(frozen=True)
 class CheckGradients:
-    """Compare every derivative of an image with finite differences; exit status 1 where one disagrees."""
+    """Compare every derivative of an image with finite differences.
+
+    The exit status is 1 where one disagrees.
+    """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/check-gradients")
-    code: int = 0  # which training shape
+    code: int = 0  # number of the training shape
     azimuth: float = 30.0  # degrees
     elevation: float = 20.0  # degrees
-    distance: float = 4.97  # of the camera from the origin
+    distance: float = 4.97  # from the camera to the origin
     focal_mm: float = 60.0
     sensor_mm: float = 32.0
     size: int = 48  # pixels along each side
@@ -28,13 +31,14 @@ class CheckGradients:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model, camera = opened(self.model, run.device), orbiting(self).to(run.device)
+        model = opened(self.model, run.device)
+        camera = orbiting(self).to(run.device)
         found = check_gradients(model.field(self.code), camera, size=self.size)
         show_table([_line(row) for row in found.rows])
-        console.print(_summary(found))
         tolerances = {"tolerance": found.precision.tolerance, "stray": STRAY, "footprint_tolerance": ROUGHLY}
         facts = {"agrees": found.agrees, "verdicts": found.verdicts(), **tolerances, "evaluations": found.evaluations}
-        run.finish({**facts, "rows": [{"model": self.model, **asdict(row)} for row in found.rows], **origin()})
+        rows = [{"model": self.model, **asdict(row)} for row in found.rows]
+        run.finish({**facts, "rows": rows, **origin()}, _summary(found))
         if not found.agrees:
             sys.exit(1)
 

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
 import tyro
 
 from distrace.checkpoints.model import Model
@@ -22,31 +22,38 @@ from distrace.photos.selection import ViewAgreement, view_agreements
 from distrace.prior import prior_of
 from distrace.report.views_page import forming, views_page
 
+if TYPE_CHECKING:
+    import trimesh
+
 
 @dataclass(frozen=True)
 class Multiview:
-    """Find a shape, and where it lies, from photographs with known cameras: no depth, and no masks but where given."""
+    """Find a shape and its placement from photographs with known cameras.
+
+    It needs a model of the object's class. It uses masks where the folder has some.
+    """
 
     model: tyro.conf.Positional[ModelName]
     views: tyro.conf.Positional[Views]
     out: Path = Path("out/multiview")
-    starts: int = PhotoConfig.starts
-    fixed: Flag = False  # the shape lies in the unit sphere as the model's shapes do; only its code is unknown
-    changing_light: Flag = False  # compare colours without their local brightness and contrast
-    ignore_masks: Flag = False  # as if no photograph had one
-    size: int = 1024  # pixels along the longer side; larger photographs are made smaller
-    rays: int = ComparisonConfig.rays  # of all views, in each stage
-    resolution: int = 256  # of the mesh
+    starts: int = PhotoConfig.starts  # of the multi-start fit
+    fixed: Flag = False  # find only the code: the object is placed as the model's shapes are
+    changing_light: Flag = False  # ignore local brightness and contrast of colours
+    ignore_masks: Flag = False  # use no masks
+    size: int = 1024  # pixels along the longer side; larger photographs are scaled down
+    rays: int = ComparisonConfig.rays  # of all views together, in each stage
+    resolution: int = 256  # cells along each side of the mesh's grid
     seed: int = 0
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
-        model, found = opened(self.model, run.device), load_photographs(self.views)
-        console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}", markup=False)
+        model = opened(self.model, run.device)
+        found = load_photographs(self.views)
+        console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}")
         for note in notes(found):
-            console.print(note, markup=False)
+            console.print(note)
         if self.size < 8:
             raise ValueError(f"--size {self.size} was given; at least 8 pixels are needed")
         views = [view.at_most(self.size).to(run.device) for view in found.views]
@@ -55,18 +62,20 @@ class Multiview:
         compared = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
         config = replace(usual, starts=self.starts, seed=self.seed, comparison=compared)
         steps = _fitted(model, views, config)
-        last, prior = steps[-1], prior_of(model.codes)
+        last = steps[-1]
+        prior = prior_of(model.codes)
         shape = PlacedShape(prior.coordinates(last.code), last.place)
         agreed = view_agreements(model.decoder, views, prior, shape, compared)
         for view in agreed:
             if view.is_outlier:
-                console.print(_doubt(view), markup=False)
+                run.warn(_doubt(view))
         mesh = _mesh(model, last, found, resolved)
         save_mesh(run.out / "mesh.ply", mesh)
         with written(run.out / "code.npy") as file:
             np.save(file, last.code.cpu().numpy())
         save_gif(run.out / "forming.gif", forming(model, steps, views[0].camera))
-        save_text(run.out / "report.html", views_page(model, views, steps, agreed, mesh))
+        with run.optional("report.html"):
+            save_text(run.out / "report.html", views_page(model, views, steps, agreed, mesh))
         run.finish(
             {
                 "loss": last.loss,
@@ -90,8 +99,8 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> l
     return steps
 
 
-def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> trimesh.Trimesh:
-    """In the world of the folder."""
+def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> "trimesh.Trimesh":
+    """Returns the mesh in the folder's world."""
     mesh = extract_mesh(model.field(step.code), config)
     mesh.apply_transform(step.place.T_world_object.cpu().numpy())
     mesh.vertices = found.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()

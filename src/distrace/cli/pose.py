@@ -11,8 +11,8 @@ import tyro
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Flag, ModelName, opened
-from distrace.cli.console import Run, console, progress, start
+from distrace.cli.common import Flag, ModelName, check_distance, default, opened
+from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
 from distrace.errors import explained
 from distrace.fields.base import SDF
@@ -21,35 +21,38 @@ from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render
 
 FRAMES = 8  # of the film strip
-STEPS = 30  # about so many from a good start
+STEPS = 30  # of a typical fit, for the progress bar
 
 
 @dataclass(frozen=True)
 class Pose:
-    """Find the camera that sees a shape as it was observed: from depth, silhouette, normals, or all of them.
+    """Find the camera of one view of a known shape.
 
-    The search starts from the observation's own T_world_camera, or from where --azimuth, --elevation and --distance
-    put it.
+    The fit compares depth, silhouette and normals. It starts from the observation's T_world_camera, or from --azimuth,
+    --elevation and --distance.
     """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
     out: Path = Path("out/pose")
-    code: str = "0"  # which training shape, or a file that `complete` wrote: code.npy
-    ignore: tuple[Literal["depth", "mask", "normal"], ...] = ()  # parts of the observation to leave out
+    code: str = "0"  # number of the training shape, or a code.npy that `complete` wrote
+    ignore: tuple[Literal["depth", "mask", "normal"], ...] = ()  # parts of the observation to ignore
     focal: Flag = False  # also find the focal length
-    azimuth: float | None = None  # degrees
-    elevation: float | None = None  # degrees; 20 where an azimuth is given
-    distance: float | None = None  # of the camera from the origin; 4.97 where an azimuth is given
-    disturb: float | None = None  # degrees by which the start is turned, to try how well it is found again
-    disturb_focal: float = 1.0  # by which the start's focal length is multiplied, to try the same of --focal
-    starts: int = CameraConfig.starts
+    azimuth: Annotated[float | None, default("the observation's camera", "FLOAT")] = None
+    """degrees, of the initial camera"""
+    elevation: Annotated[float | None, default("20, with --azimuth", "FLOAT")] = None  # degrees
+    distance: Annotated[float | None, default("4.97, with --azimuth", "FLOAT")] = None  # to the origin
+    disturb: Annotated[float | None, default(0.0)] = None
+    """degrees by which the initial camera is rotated, to test convergence"""
+    disturb_focal: float = 1.0  # factor on the initial focal length, to test --focal
+    starts: int = CameraConfig.starts  # of the multi-start fit
     seed: int = 0
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model, observed = opened(self.model, run.device), read_view(self.observation).to(run.device)
+        model = opened(self.model, run.device)
+        observed = read_view(self.observation).to(run.device)
         field = model.field(_code(model, self.code))
         first = self._start(observed.camera)
         steps = []
@@ -80,16 +83,17 @@ class Pose:
         return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros_like(axis))
 
     def _placed(self, camera: Camera) -> torch.Tensor:
-        """The pose to start from: the observation's own, or where the command says."""
-        elevation, distance = self.elevation, self.distance
+        """Returns the initial pose: the observation's, or that of the options."""
+        check_distance(self.distance)
         if self.azimuth is not None:
-            where = self.azimuth, 20.0 if elevation is None else elevation, 4.97 if distance is None else distance
-            around = Camera.orbit(*where, focal_px=float(camera.intrinsics[0, 0]))
+            elevation = 20.0 if self.elevation is None else self.elevation
+            distance = 4.97 if self.distance is None else self.distance
+            focal_px = float(camera.intrinsics[0, 0])
+            around = Camera.orbit(self.azimuth, elevation, distance, focal_px=focal_px)
             return around.T_world_camera.to(camera.T_world_camera)
-        if (elevation, distance) != (None, None):
-            raise ValueError(
-                f"--elevation {elevation} --distance {distance} were given without --azimuth; together they place it"
-            )
+        if (self.elevation, self.distance) != (None, None):
+            given = f"--elevation {self.elevation} --distance {self.distance}"
+            raise ValueError(f"{given} were given without --azimuth; all three place the camera")
         return camera.T_world_camera
 
     def _finish(self, run: Run, observed: View, steps: list[CameraStep]) -> None:
@@ -107,11 +111,11 @@ class Pose:
         focal = 100 * abs(float(last.camera.intrinsics[0, 0] / observed.camera.intrinsics[0, 0]) - 1)
         facts |= {"degrees_from_observation": degrees, "percent_from_observation": percent}
         facts |= {"focal_percent_from_observation": focal}
-        console.print(
-            f"{last.off:.1%} of the rays are off; from the observation's own camera it is {degrees:.3f}°,"
-            f" {percent:.3f} % of the distance and {focal:.3f} % of the focal length"
+        run.finish(
+            facts,
+            f"{last.off:.1%} of the rays disagree; difference from the observation's camera: {degrees:.3f}°,"
+            f" {percent:.3f} % of the distance, {focal:.3f} % of the focal length",
         )
-        run.finish(facts)
 
 
 def _code(model: Model, given: str) -> int | torch.Tensor:
@@ -125,7 +129,7 @@ def _code(model: Model, given: str) -> int | torch.Tensor:
 
 
 def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.Picture:
-    """The observed mask and the rendered one, from the start to the end; below, what is rendered."""
+    """Returns steps of the fit: above, the observed and the rendered mask; below, the rendered shape."""
     mask = observed.seen if observed.mask is None else observed.mask
     picked = [steps[round(k * (len(steps) - 1) / (FRAMES - 1))] for k in range(min(FRAMES, len(steps)))]
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""`reconstruct`: shape and colours of any object from photographs with masks or a dark background; no model needed."""
+"""`reconstruct`: shape and colours of any object, without a model, from photographs."""
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
@@ -9,7 +9,6 @@ import tyro
 from distrace.cli.common import Every, Flag, Views
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
-from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
 from distrace.files import alone, save_json
@@ -35,42 +34,44 @@ PREVIEWED = 160  # pixels along the longer side
 
 @dataclass(frozen=True)
 class Reconstruct:
-    """Find shape and colours of any object from photographs with known cameras, by the weights of a network.
+    """Reconstruct any object from photographs with known cameras.
 
-    They need masks, or a dark background. Run it again to go on after a stop.
+    Photographs need masks or a dark background. A run that was interrupted continues when run again.
     """
 
     views: tyro.conf.Positional[Views]
     out: Path = Path("out/reconstruct")
-    steps: int = ReconstructConfig.steps  # that shape
-    retouching: int = ReconstructConfig.refinement_steps  # steps after them, of the colours alone
-    sizes: tuple[int, ...] = ReconstructConfig.sizes  # of the images' longer sides, in pixels, one after the other
-    rays: int = ReconstructConfig.rays  # of each step
+    steps: int = ReconstructConfig.steps  # of shape and colours
+    retouching: int = ReconstructConfig.refinement_steps  # further steps, of the colours alone
+    sizes: tuple[int, ...] = ReconstructConfig.sizes  # pixels along the images' longer sides, from coarse to fine
+    rays: int = ReconstructConfig.rays  # in each step
     width: int = SurfaceSpecs.width  # of the surface's network
-    silhouettes_only: Flag = False  # colours do not shape the surface: a visual hull, painted
-    held_out: int = 8  # one view in so many is not fitted to, but compared; 0 for none
-    leave_out: tuple[str, ...] = ()  # names of views that are not used at all
-    resolution: int = 256  # of the mesh
+    silhouettes_only: Flag = False  # fit the shape to silhouettes alone; colours do not shape it
+    held_out: int = 8  # compare one view in so many instead of fitting to it; 0 for none
+    leave_out: tuple[str, ...] = ()  # names of views to ignore
+    resolution: int = 256  # cells along each side of the mesh's grid
     seed: int = 0
-    save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
+    save_every: float = 60.0  # seconds between checkpoints
     device: str = "cpu"
 
     @flushed_denormals()
     def run(self) -> None:
         saving = Every(self.save_every)
+        from distrace.data.background_segmentation import masked  # brings scikit-image
+
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
         found = masked(load_photographs(self.views))
         for note in notes(found):
-            console.print(note, markup=False)
+            console.print(note)
         found = replace(found, views=without(found.views, self.leave_out))
         for each in mask_overlaps(found.views):
             if each.is_outlier:
-                console.print(_doubt(each), markup=False)
-        told, kept_back = parted(found.views, self.held_out)
+                run.warn(_doubt(each))
+        fitted_to, held_out = parted(found.views, self.held_out)
         with alone(run.out):
-            state = fitted(run, told, (kept_back or told)[0], self.config, self.specs, saving)
-            Reconstructed(self.views.name, state, self.config, found.placement, told, kept_back).save(run, resolved)
+            state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
+            Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out).save(run, resolved)
 
     @property
     def config(self) -> ReconstructConfig:
@@ -83,29 +84,29 @@ class Reconstruct:
 
 
 def without(views: Sequence[Photograph], names: Sequence[str]) -> tuple[Photograph, ...]:
-    """The views of other names. Raises `ValueError` for a name that no view has."""
+    """Returns the views of other names. Raises `ValueError` for a name that no view has."""
     unknown = set(names) - {view.name for view in views}
     if unknown:
-        known = ", ".join(view.name for view in views)
-        raise ValueError(f"--leave-out {' '.join(sorted(unknown))}: no such view; there are {known}")
+        existing = ", ".join(view.name for view in views)
+        raise ValueError(f"--leave-out {' '.join(sorted(unknown))}: no such view; there are {existing}")
     return tuple(view for view in views if view.name not in names)
 
 
 def parted(views: Sequence[Photograph], every: int) -> tuple[list[Photograph], list[Photograph]]:
-    """Views to fit to, and one in so many to compare, of those that show the object.
+    """Returns the views to fit to, and those held out: one in `every`, of the views that show the object.
 
-    Raises `ValueError` where fewer than two are left.
+    Raises `ValueError` where fewer than two remain to fit to.
     """
     if every < 0:
         raise ValueError(f"--held-out {every} was given; one view in so many is held out, 0 for none")
-    apart = set(range(every // 2 - 1, len(views), every)) if every > 1 else set()
-    apart = {number for number in apart if views[number].mask is None or views[number].known_mask.any()}
-    told = [view for number, view in enumerate(views) if number not in apart]
-    if every == 1 or len(told) < 2:
+    numbers = set(range(every // 2 - 1, len(views), every)) if every > 1 else set()
+    numbers = {number for number in numbers if views[number].mask is None or views[number].known_mask.any()}
+    fitted_to = [view for number, view in enumerate(views) if number not in numbers]
+    if every == 1 or len(fitted_to) < 2:
         raise ValueError(
             f"--held-out {every} leaves too few of {len(views)} views to fit to; give a larger number, or 0"
         )
-    return told, [views[number] for number in sorted(apart)]
+    return fitted_to, [views[number] for number in sorted(numbers)]
 
 
 def fitted(
@@ -116,15 +117,15 @@ def fitted(
     specs: SurfaceSpecs,
     saving: Every,
 ) -> Reconstruction:
-    """Fits to the end from wherever the folder's checkpoint is; saves now and then, with a look at one view."""
+    """Continues from the folder's checkpoint to the last step; saves checkpoints, and previews of one view."""
     marks = [fingerprint(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
     if state.step:
-        console.print(f"going on from step {state.step} of {config.total}")
+        console.print(f"continuing from step {state.step} of {config.total}")
     else:
         for preview in (run.out / "previews").glob("*.png"):
             preview.unlink()  # of a run whose checkpoint was moved away
-    depths = _begun(state, views, config)
+    depths = _initialised(state, views, config)
     names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     due = -(-config.total // PREVIEWS)
@@ -140,9 +141,10 @@ def fitted(
     return state
 
 
-def _begun(state: Reconstruction, views: Sequence[Photograph], config: ReconstructConfig) -> ConsistentDepths:
-    """A fresh run begins; the depths that count in the steps that are left."""
-    depths, compared = NO_DEPTHS, config.shape_from_colour and state.step < config.steps
+def _initialised(state: Reconstruction, views: Sequence[Photograph], config: ReconstructConfig) -> ConsistentDepths:
+    """Initialises a new run from the visual hull; returns the multi-view depths that the remaining steps use."""
+    depths = NO_DEPTHS
+    compared = config.shape_from_colour and state.step < config.steps
     if state.step and not compared:
         return depths
     hull = visual_hull(views)
@@ -150,15 +152,14 @@ def _begun(state: Reconstruction, views: Sequence[Photograph], config: Reconstru
         console.print("comparing photographs with their neighbours")
         depths = informative_depths(views, hull)
         if len(depths):
-            console.print(f"{len(depths):,} depths that photographs agree on tell what outlines do not")
+            console.print(f"{len(depths):,} depths agree across views")
     if not state.step:
-        console.print("teaching the network what is known before colours")
+        console.print("initialising the network from silhouettes and depths")
         initialise(state, hull, config, depths)
     return depths
 
 
 def _doubt(view: MaskOverlap) -> str:
-    agreed = f"its outline and that of all others have {view.iou:.0%} in common"
-    return (
-        f"{view.name} does not agree with the others: {agreed}; is its camera right? --leave-out {view.name} drops it"
-    )
+    overlap = f"its outline overlaps with theirs by {view.iou:.0%}"
+    remedy = f"check its camera, or drop it by --leave-out {view.name}"
+    return f"{view.name} disagrees with the other views: {overlap}; {remedy}"

@@ -1,18 +1,17 @@
-"""What `reconstruct` leaves in its folder: mesh, page, film, figures and cameras."""
+"""The results of `reconstruct`: mesh, page, film, figures and cameras."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from statistics import median
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-import trimesh
-from PIL import Image
 
 from distrace.cli.common import save_mesh
-from distrace.cli.console import Run, console, device_name
+from distrace.cli.console import Run, device_name
 from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
@@ -23,24 +22,29 @@ from distrace.reconstruction.state import ReconstructConfig, Reconstruction, rig
 from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
+if TYPE_CHECKING:
+    import trimesh
+
 TOLD = 4  # views that were fitted to, on the page
 
 
 @dataclass(frozen=True)
 class Reconstructed:
-    """A finished reconstruction, and what it was made from."""
+    """A finished reconstruction and its photographs."""
 
     name: str
     state: Reconstruction
     config: ReconstructConfig
     placement: Placement
-    told: Sequence[Photograph]
-    kept_back: Sequence[Photograph]
+    fitted_to: Sequence[Photograph]
+    held_out: Sequence[Photograph]
 
     def save(self, run: Run, config: MeshConfig) -> None:
-        """Mesh in the folder's world, page, film and `result.json`."""
-        mesh, held_out = coloured_mesh(self.state, config), self._judged(self.kept_back)
-        self._save_page(run, mesh, held_out)
+        """Writes the mesh in the folder's world, the page, the film and `result.json`."""
+        mesh = coloured_mesh(self.state, config)
+        held_out = self._judged(self.held_out)
+        with run.optional("report.html"):
+            self._save_page(run, mesh, held_out)
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
@@ -57,27 +61,22 @@ class Reconstructed:
                 "cameras": self._cameras(),
                 "steps": self.state.step,
                 "evaluations": self.state.evaluations,
-            }
+            },
+            *map(_summary, rows),
         )
-        for row in rows:
-            console.print(
-                f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}; with their cameras"
-                f" corrected as their neighbours' were {row['psnr_corrected']} dB, {row['silhouette_iou_corrected']};"
-                f" registered {row['psnr_aligned']} dB, {row['silhouette_iou_aligned']}"
-            )
 
     @cached_property
     def _refined(self) -> list[Photograph]:
-        """The views that were fitted to, with their cameras as they are now."""
-        return [moved(*each) for each in zip(self.told, self.state.motions().detach().cpu(), strict=True)]
+        """Returns the views that were fitted to, with their refined cameras."""
+        return [moved(*each) for each in zip(self.fitted_to, self.state.motions().detach().cpu(), strict=True)]
 
     @cached_property
     def _drifts(self) -> list[float]:
-        """By how many pixels their cameras moved."""
-        return [pixel_shift(*each) for each in zip(self.told, self._refined, strict=True)]
+        """Returns by how many pixels each camera moved."""
+        return [pixel_shift(*each) for each in zip(self.fitted_to, self._refined, strict=True)]
 
     def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
-        """Views in the size that was fitted last."""
+        """Compares views with their renderings, in the size that was fitted last."""
         return [judged(self.state, view, self.config.sizes[-1]) for view in views]
 
     def _rows(self, held_out: Sequence[Judged]) -> list[dict[str, object]]:
@@ -85,34 +84,34 @@ class Reconstructed:
             return []
         judgements = {
             "": held_out,
-            "_corrected": self._judged([self._corrected(view) for view in self.kept_back]),
-            "_aligned": self._judged([registered(self.state, view, self.config) for view in self.kept_back]),
+            "_corrected": self._judged([self._corrected(view) for view in self.held_out]),
+            "_aligned": self._judged([registered(self.state, view, self.config) for view in self.held_out]),
         }
         method = "ours" if self.config.shape_from_colour else "hull"
         return [row_of(self.name, method, judgements, self.state.seconds)]
 
     def _corrected(self, view: Photograph) -> Photograph:
-        """With its camera moved as those of its neighbours were; nothing of the photograph is looked at."""
+        """Returns the view with its camera moved as its neighbours' were; the photograph is not used."""
         steps = self.state.relative_steps.detach().cpu()
-        eyes = torch.stack([each.camera.T_world_camera[:3, 3] for each in self.told])
+        eyes = torch.stack([each.camera.T_world_camera[:3, 3] for each in self.fitted_to])
         step = interpolated_step(steps, eyes, view.camera.T_world_camera[:3, 3])
         return moved(view, rigid_motions(step[None])[0])
 
-    def _save_page(self, run: Run, mesh: trimesh.Trimesh, held_out: Sequence[Judged]) -> None:
-        some = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
+    def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[Judged]) -> None:
+        examples = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
         facts = {
-            "views": f"{len(self.told)}, and {len(held_out)} held out",
+            "views": f"{len(self.fitted_to)}, and {len(held_out)} held out",
             "steps": f"{self.state.step:,} of {self.config.rays} rays",
             "time of the steps": f"{self.state.seconds / 60:.0f} minutes on {device_name(run.device)}",
             "evaluations of the surface": f"{self.state.evaluations:,}",
             "shaped by": "colours and outlines" if self.config.shape_from_colour else "outlines",
             "cameras moved": f"by {median(self._drifts):.2f} pixels (median), {max(self._drifts):.2f} at most",
         }
-        text = reconstruction_page(self.name, held_out, some, self.state.loss_history, mesh, facts)
-        save_text(run.out / "report.html", text)
+        page = reconstruction_page(self.name, held_out, examples, self.state.loss_history, mesh, facts)
+        save_text(run.out / "report.html", page)
 
     def _cameras(self) -> dict[str, object]:
-        """In the folder's world, and by how many pixels they moved."""
+        """Returns the refined cameras in the folder's world, and by how many pixels they moved."""
         return {
             view.name: {
                 "pixels_moved": round(pixels, 3),
@@ -122,8 +121,18 @@ class Reconstructed:
         }
 
 
+def _summary(row: dict[str, object]) -> str:
+    return (
+        f"held-out views: {row['psnr']} dB, intersection over union {row['silhouette_iou']}; with their cameras"
+        f" corrected as their neighbours' were {row['psnr_corrected']} dB, {row['silhouette_iou_corrected']};"
+        f" registered {row['psnr_aligned']} dB, {row['silhouette_iou_aligned']}"
+    )
+
+
 def _save_film(folder: Path) -> None:
-    """The previews, one after the other."""
+    """Writes the previews, one after the other, as a GIF."""
+    from PIL import Image
+
     pictures = [np.asarray(Image.open(path).convert("RGB")) for path in sorted((folder / "previews").glob("*.png"))]
     if pictures:
         save_gif(folder / "forming.gif", np.stack(pictures))

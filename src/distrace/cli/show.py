@@ -1,22 +1,23 @@
-"""`render` and `mesh`: looking at a model."""
+"""`render` and `mesh`: images and meshes of a model."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import torch
 import tyro
 
 from distrace.camera import Camera
-from distrace.cli.common import Flag, ModelName, opened, orbiting, save_buffers, save_mesh, save_pictures
-from distrace.cli.console import console, progress, start
+from distrace.cli.common import Flag, ModelName, default, opened, orbiting, save_buffers, save_mesh, save_pictures
+from distrace.cli.console import progress, start
 from distrace.data.observation import View as Observation
 from distrace.data.observation import save_view
 from distrace.fields.base import Counted
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
+from distrace.optional import require
 from distrace.render import STRATEGIES, Buffers, Config
 from distrace.report.completion_page import View
 from distrace.shading import Picture
@@ -25,7 +26,7 @@ from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig
 
 @dataclass(frozen=True)
 class Tally:
-    """What one image took, and what became of its rays."""
+    """The evaluations of one image, and how its rays ended."""
 
     evaluations: int
     setup_evaluations: int
@@ -45,25 +46,31 @@ class Tally:
 
 @dataclass(frozen=True)
 class Render:
-    """Render one view: depth, normals, mask and a shaded picture, as PNGs and as arrays."""
+    """Render one view: depth, normals, mask and a shaded picture.
+
+    They are written as PNGs and as arrays; with --orbit also a movie.
+    """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     out: Path = Path("out/render")
     code: int = 0  # which training shape
-    orbit: int | None = None  # also a movie, as MP4 and GIF: so many frames, once around the vertical axis
+    orbit: Annotated[int | None, default("no movie", "INT")] = None
+    """frames of a movie (MP4 and GIF) that turns once around the vertical axis"""
     azimuth: float = 30.0  # degrees
     elevation: float = 20.0  # degrees
-    distance: float = 4.97  # of the camera from the origin
+    distance: float = 4.97  # from the camera to the origin, in radii of the unit sphere
     focal_mm: float = 60.0
     sensor_mm: float = 32.0
     size: int = 512  # pixels along each side
     strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine", "fast"] = "fast"
-    """fast: cells, cones of pixel blocks, single rays in lock step; the others are DIST's strategies"""
-    steps: int | None = None  # at most, of every strategy but fast; as the strategy has it, if not given
-    clearance: Flag = False  # also the field's least value on each ray that misses, which costs evaluations
+    """fast is distrace's tracer; the others are DIST's strategies"""
+    steps: Annotated[int | None, default("the strategy's", "INT")] = None  # maximum for a ray; not for fast
+    clearance: Flag = False  # also write the least distance on each ray that misses, at the cost of evaluations
     device: str = "cpu"
 
     def run(self) -> None:
+        if self.orbit is not None:
+            require("--orbit", "av")
         run = start(self.out, self.device)
         camera = orbiting(self).to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
@@ -75,12 +82,12 @@ class Render:
             )
         facts = _facts(tallies, counted.evaluations)
         pixels = self.size * self.size * len(tallies)
-        console.print(f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations")
+        summary = f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations"
         frames = {} if self.orbit is None else _each(tallies)
-        run.finish({**facts, "strategy": self.strategy, **frames, "warnings": run.warnings})
+        run.finish({**facts, "strategy": self.strategy, **frames}, summary)
 
     def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
-        """The same views; the first leaves its pictures and its arrays, also as an observation for other commands."""
+        """Yields the views; writes the pictures and arrays of the first, and an observation for other commands."""
         first = next(views)
         save_pictures(self.out, first, camera)
         save_buffers(self.out / "buffers.npz", first, self.clearance)
@@ -94,13 +101,13 @@ class Render:
             return config
         if not isinstance(config, TraceConfig):
             raise ValueError(
-                f"--steps {self.steps} was given, and fast counts none; choose another --strategy, or no steps"
+                f"--steps {self.steps} was given, and fast counts none; choose another --strategy, or omit --steps"
             )
         return replace(config, steps=self.steps)
 
 
 def _movie(folder: Path, views: Iterator[Buffers], frames: int) -> list[Tally]:
-    """Writes the shaded views as a movie; what each of them took."""
+    """Writes the shaded views as a movie; returns the tally of each."""
     tallies: list[Tally] = []
     pictures: list[Picture] = []
     with progress("turning", frames) as bar:
@@ -114,7 +121,7 @@ def _movie(folder: Path, views: Iterator[Buffers], frames: int) -> list[Tally]:
 
 
 def _facts(tallies: list[Tally], evaluations: int) -> dict[str, Any]:
-    """Sums over all images; `evaluations` is how often the field was asked for anything at all."""
+    """Returns sums over all images; `evaluations` counts every point at which the field was evaluated."""
     traced = sum(tally.evaluations for tally in tallies)
     outcomes: dict[str, int] = {name: sum(tally.outcomes[name] for tally in tallies) for name in tallies[0].outcomes}
     return {
@@ -127,7 +134,7 @@ def _facts(tallies: list[Tally], evaluations: int) -> dict[str, Any]:
 
 
 def _each(tallies: list[Tally]) -> dict[str, Any]:
-    """What a movie tells beyond that of its frames, one by one."""
+    """Returns what `result.json` adds for a movie: the cost of each frame."""
     return {"frames": len(tallies), "evaluations_per_visible_pixel": [tally.per_visible_pixel for tally in tallies]}
 
 
@@ -147,6 +154,5 @@ class Mesh:
         with run.noticing():
             surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
         save_mesh(run.out / "mesh.ply", surface)
-        console.print(f"{len(surface.faces)} faces")
         evaluations = {"evaluations": counted.evaluations, "setup_evaluations": counted.evaluations}
-        run.finish({**evaluations, "faces": len(surface.faces), "warnings": run.warnings})
+        run.finish({**evaluations, "faces": len(surface.faces)}, f"{len(surface.faces)} faces")

@@ -1,16 +1,17 @@
-"""`train`: from samples to a model, going on where it was stopped."""
+"""`train`: from samples to a model; an interrupted run continues when run again."""
 
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from statistics import median_high
+from typing import Annotated, Any
 
 import torch
 import tyro
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import Every, opened
+from distrace.cli.common import Every, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
@@ -31,122 +32,127 @@ from distrace.training.trainer import start as start_training
 from distrace.training.trainer import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
-TRIED = 20  # steps that tell how many fit into --minutes
-PREVIEWED = 5
+TRIAL_STEPS = 20  # timed to choose the steps for --minutes
+PREVIEWED = 5  # shapes
 
 
 @dataclass(frozen=True)
 class Train:
-    """Train a DeepSDF decoder and the codes of its shapes. Run it again to go on after a stop."""
+    """Train a DeepSDF decoder and the codes of its shapes.
+
+    A run that was interrupted continues when run again. It keeps its options, unless others are given.
+    """
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: tuple[Path, ...] = ()  # CSV files: learn only their training shapes and variants of these
-    minutes: float | None = None  # as many steps as fit, at the speed of the first ones
-    steps: int | None = None  # 36,000; more of them prolong a run that was stopped or is done
-    wrong_sign: float | None = None  # 1; × as much counts a sample on the wrong side: what thin parts are lost by
-    large: float | None = None  # errors above count by their squares; 0.02 keeps gaps open
-    dwell: int | None = None  # 1; times a sample is drawn near places that --begin-with has on the wrong side
-    keep: float | None = None  # 0; × as much as samples counts that --begin-with stays as it is between its shapes
-    variant_weight: float | None = None  # 0.5; how often a variant or a procedural shape is drawn, to once the others
-    learning_rate: float | None = None  # 0.001; less where a model is learnt further
-    samples_per_step: int | None = None  # 2,048
-    layers: int | None = None  # 8
-    width: int | None = None  # 512
-    code_length: int | None = None  # 256
-    begin_with: str | None = None  # a model, bundled or in a folder, whose network and codes are learnt further
-    seed: int | None = None  # 0
-    save_every: float = 60.0  # seconds between checkpoints, of which a killed run loses at most one
+    split: tuple[Path, ...] = ()  # CSV files: train only on their training shapes and variants of these
+    minutes: Annotated[float | None, default("no limit", "FLOAT")] = None
+    """wall-clock time; it sets the number of steps"""
+    steps: Annotated[int | None, default(TrainConfig.steps)] = None  # a larger number prolongs a finished run
+    wrong_sign: Annotated[float | None, default(TrainConfig.wrong_sign)] = None
+    """loss weight of samples whose predicted sign is wrong; raise it when thin parts vanish"""
+    large: Annotated[float | None, default(TrainConfig.large)] = None
+    """errors above this count by their squares; 0.02 keeps gaps open"""
+    dwell: Annotated[int | None, default(TrainConfig.dwell)] = None
+    """oversampling factor near places where --begin-with has the wrong sign"""
+    keep: Annotated[float | None, default(TrainConfig.keep)] = None
+    """loss weight of the distillation term, which keeps --begin-with between its shapes"""
+    variant_weight: Annotated[float | None, default(TrainConfig.variant_weight)] = None
+    """sampling weight of variants and procedural shapes; the others have 1"""
+    learning_rate: Annotated[float | None, default(TrainConfig.learning_rate)] = None  # lower it with --begin-with
+    samples_per_step: Annotated[int | None, default(TrainConfig.samples_per_step)] = None
+    layers: Annotated[int | None, default(DEEPSDF["layers"])] = None
+    width: Annotated[int | None, default(DEEPSDF["width"])] = None
+    code_length: Annotated[int | None, default(DEEPSDF["code_length"])] = None
+    begin_with: Annotated[str | None, default("none", "MODEL")] = None  # a model to continue training from
+    seed: Annotated[int | None, default(TrainConfig.seed)] = None
+    save_every: float = 60.0  # seconds between checkpoints
     device: str = "cpu"
 
     def run(self) -> None:
         if self.minutes is not None and not 0 < self.minutes < math.inf:
-            raise ValueError(f"--minutes {self.minutes} was given; a finite time is needed, longer than none")
+            raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
         run = start(self.out, self.device)
         with alone(run.out), flushed_denormals(), run.noticing():
-            self._learn(run, saving)
+            self._train(run, saving)
 
-    def _learn(self, run: Run, saving: Every) -> None:
-        """All of it, from samples to the run's result."""
+    def _train(self, run: Run, saving: Every) -> None:
         loaded = load_samples(sample_files(self.samples, self.out, self.split)).to(run.device)
-        known = None if self.begin_with is None else opened(self.begin_with, run.device)
+        initial = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         config = self._prolonged(*resumed) if resumed else self._fresh()
-        kept = self._kept(config, known, loaded.names)
+        kept = self._kept(config, initial, loaded.names)
         if resumed:
             training = resumed[0]
             if kept and kept.codes.shape != training.codes.shape:
                 raise ValueError(
-                    f"the run in {self.out} has longer or shorter codes than {self.begin_with}; it began with another"
+                    f"the run in {self.out} has codes of another length than {self.begin_with}; give another --out"
                 )
-            console.print(f"going on from step {training.step} of {config.steps}")
+            console.print(f"continuing from step {training.step} of {config.steps}")
         else:
-            training, config = self._begun(loaded, config, known, kept, run.device)
-            save_training(self.out, training, config, loaded.names)  # what was timed is chosen once, and kept
-        if known is not None and config.dwell > 1:
-            console.print(f"looking where {known.name} is wrong")
-            loaded = dwelling(loaded, known, config.dwell)
+            training, config = self._initialised(loaded, config, initial, kept, run.device)
+            save_training(self.out, training, config, loaded.names)  # timed choices stay when the run is continued
+        if initial is not None and config.dwell > 1:
+            console.print(f"finding samples whose sign {initial.name} has wrong")
+            loaded = dwelling(loaded, initial, config.dwell)
         loss = _run(run, loaded, training, config, kept, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
-    def _specs(self, known: Model | None) -> NetworkSpecs:
-        """With weight norm, as DeepSDF has it; of a model's size if there is one."""
-        said = _said(self, *DEEPSDF)
-        if known is None:
-            size = {**DEEPSDF, **said}
-            layers, width, code_length = size.values()
+    def _specs(self, initial: Model | None) -> NetworkSpecs:
+        """Returns a network with weight norm, as DeepSDF's, of the initial model's size if there is one."""
+        given = _given(self, *DEEPSDF)
+        if initial is None:
+            layers, width, code_length = {**DEEPSDF, **given}.values()
             if min(layers, width) < 1:
                 raise ValueError(f"--layers {layers} --width {width} were given; a network has at least one of each")
             return NetworkSpecs((width,) * layers, code_length, (layers // 2,), norm_layers=tuple(range(layers)))
-        if said:
-            sizes = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in said.items())
-            raise ValueError(f"{sizes} was given beside --begin-with {known.name}, whose size the network takes")
-        specs = known.decoder.specs
+        if given:
+            sizes = " ".join(f"--{name.replace('_', '-')} {value}" for name, value in given.items())
+            raise ValueError(f"{sizes} was given beside --begin-with {initial.name}, whose size the network takes")
+        specs = initial.decoder.specs
         if specs.norm_layers and not specs.weight_norm:
-            raise ValueError(f"{known.name} has layer norms, which are not learnt further; train without --begin-with")
+            raise ValueError(f"{initial.name} has layer norms, which cannot be trained; omit --begin-with")
         return replace(specs, norm_layers=tuple(range(len(specs.dims))), weight_norm=True)
 
     def _fresh(self) -> TrainConfig:
-        return replace(self._changed(TrainConfig()), **_said(self, "samples_per_step", "seed"))
+        return replace(self._changed(TrainConfig()), **_given(self, "samples_per_step", "seed"))
 
-    def _begun(
-        self, samples: Samples, config: TrainConfig, known: Model | None, kept: Kept | None, device: torch.device
+    def _initialised(
+        self, samples: Samples, config: TrainConfig, initial: Model | None, kept: Kept | None, device: torch.device
     ) -> tuple[Training, TrainConfig]:
-        """A run at its first step, and for how many steps."""
-        specs = self._specs(known)
+        """Returns a run before its first step, and its configuration."""
+        specs = self._specs(initial)
         config = replace(config, bfloat16=faster_in_bfloat16(specs, device))
         training = start_training(len(samples.names), specs, config, device)
-        if known is not None:
-            begin_with(training, samples.names, known)
+        if initial is not None:
+            begin_with(training, samples.names, initial)
         if self.minutes is not None:
-            config = _as_long_as(self.minutes, samples, specs, config, kept, device)
+            config = _timed(self.minutes, samples, specs, config, kept, device)
         return training, config
 
-    def _kept(self, config: TrainConfig, known: Model | None, names: list[str]) -> Kept | None:
-        """What is to stay of the model that is learnt further. Raises `ValueError` where none was given and one is."""
-        if known is not None:
-            return Kept.of(known, names) if config.keep else None
+    def _kept(self, config: TrainConfig, initial: Model | None, names: list[str]) -> Kept | None:
+        """Returns the distillation's teacher, if any. Raises `ValueError` for options that lack --begin-with."""
+        if initial is not None:
+            return Kept.of(initial, names) if config.keep else None
         if config.dwell > 1 or config.keep:
-            raise ValueError(
-                f"{self.out} is taught what a model has wrong or is to keep; add --begin-with and the model"
-            )
+            raise ValueError(f"the run in {self.out} uses --dwell or --keep; add --begin-with and the model")
         return None
 
     def _changed(self, config: TrainConfig) -> TrainConfig:
-        """What was said replaces defaults, and what a run had before."""
-        said = _said(self, "steps", "wrong_sign", "large", "dwell", "keep", "variant_weight", "learning_rate")
+        """Returns the configuration with the given options."""
+        given = _given(self, "steps", "wrong_sign", "large", "dwell", "keep", "variant_weight", "learning_rate")
         if self.learning_rate is not None:
-            said["code_learning_rate"] = 2 * self.learning_rate
-        return replace(config, **said)
+            given["code_learning_rate"] = 2 * self.learning_rate
+        return replace(config, **given)
 
     def _prolonged(self, training: Training, config: TrainConfig) -> TrainConfig:
-        """Raises `ValueError` where something was said that a run which goes on has otherwise, or did already."""
+        """Returns a resumed run's configuration. Raises `ValueError` for options that a run cannot change."""
         specs = training.decoder.specs
         has = {"samples_per_step": config.samples_per_step, "seed": config.seed, "code_length": specs.code_length}
         has |= {"layers": len(specs.dims), "width": specs.dims[0]}
-        for name, value in _said(self, *has).items():
+        for name, value in _given(self, *has).items():
             if value != has[name]:
                 option = f"--{name.replace('_', '-')}"
                 raise ValueError(
@@ -159,31 +165,32 @@ class Train:
         return self._changed(config)
 
 
-def _said(command: Train, *names: str) -> dict[str, Any]:
-    """Options that were given."""
+def _given(command: Train, *names: str) -> dict[str, Any]:
+    """Returns the options that were given."""
     return {name: getattr(command, name) for name in names if getattr(command, name) is not None}
 
 
-def _as_long_as(
+def _timed(
     minutes: float, samples: Samples, specs: NetworkSpecs, config: TrainConfig, kept: Kept | None, device: torch.device
 ) -> TrainConfig:
-    """The configuration with as many steps as fit into the time, by the median of a few on a training of their own."""
+    """Returns the configuration with the steps that fit into the time, by the median of a few trial steps."""
     trial = start_training(len(samples.names), specs, config, device)
-    seconds = sorted(step.seconds for step in run_training(samples, trial, replace(config, steps=TRIED), kept))
-    return replace(config, steps=max(int(minutes * 60 / seconds[TRIED // 2]), TRIED))
+    steps = run_training(samples, trial, replace(config, steps=TRIAL_STEPS), kept)
+    seconds = median_high(step.seconds for step in steps)
+    return replace(config, steps=max(int(minutes * 60 / seconds), TRIAL_STEPS))
 
 
 def _run(
     run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None, saving: Every
 ) -> float:
-    """Trains to the end, saving now and then; the mean loss of the last steps."""
+    """Trains to the last step and saves checkpoints; returns the mean loss of the last steps."""
     loss = training.losses[-1] if training.losses else math.nan
     with progress("training", config.steps) as bar:
         for step in run_training(samples, training, config, kept):
             if not math.isfinite(step.loss):
                 raise ValueError(
-                    f"the training has diverged at step {step.step}; {run.out} has what was saved before. Let wrong"
-                    " signs and large errors count less, or look for samples that are far off"
+                    f"the training has diverged at step {step.step}; {run.out} has the last checkpoint; lower"
+                    " --learning-rate or --wrong-sign, or look for wrong samples"
                 )
             loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
@@ -194,15 +201,17 @@ def _run(
 
 
 def _save(run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None) -> None:
-    """The checkpoint to go on from, the model in DeepSDF's layout, the loss so far, and a look at a few shapes."""
+    """Writes the checkpoint, the model in DeepSDF's layout, the loss history, and previews of a few shapes."""
     save_training(run.out, training, config, samples.names)
-    save_course(run.out / "losses.png", training.losses, COURSE, "steps", f"mean loss of {COURSE} steps")
+    with run.optional("losses.png"):
+        save_course(run.out / "losses.png", training.losses, COURSE, "steps", f"mean loss of {COURSE} steps")
     others = kept.others if kept else {}
     codes = torch.stack([*training.codes.detach(), *others.values()])
     model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
     save_experiment(run.out, model.decoder, model.codes, model.shapes)
     training.decoder.eval()
     camera = poster_view(128).to(run.device)
-    shown = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
+    numbers = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
     with torch.no_grad():
-        save_png(run.out / "preview.png", side_by_side([View.of(render(model.field(n), camera)).shaded for n in shown]))
+        pictures = [View.of(render(model.field(number), camera)).shaded for number in numbers]
+    save_png(run.out / "preview.png", side_by_side(pictures))
