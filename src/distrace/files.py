@@ -1,5 +1,6 @@
 """Files that are whole or absent, never half written."""
 
+import glob
 import json
 import os
 from collections.abc import Generator
@@ -14,9 +15,13 @@ from torch import Tensor
 
 @contextmanager
 def written(path: str | Path) -> Generator[BinaryIO, None, None]:
-    """Opens a file to write; it gets the name `path` once all of it is on the disk."""
+    """Opens a file to write; it gets the name `path` once all of it is on the disk.
+
+    A symbolic link of that name is replaced, not followed. Parts that killed processes left of the file are removed.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    _remove_stale_parts(path)
     part = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         with part.open("wb") as file:
@@ -32,10 +37,10 @@ def written(path: str | Path) -> Generator[BinaryIO, None, None]:
 def alone(folder: str | Path) -> Generator[None, None, None]:
     """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
     try:
-        held = FileLock(Path(folder) / ".lock").acquire(blocking=False)
+        lock = FileLock(Path(folder) / ".lock").acquire(blocking=False)
     except Timeout:
         raise ValueError(f"another run is writing {folder}; wait for its end, or give another --out") from None
-    with held:
+    with lock:
         yield
 
 
@@ -47,8 +52,7 @@ def save_text(path: str | Path, text: str) -> None:
 
 def save_json(path: str | Path, content: Any) -> None:
     """Writes JSON; numbers of other types become floats."""
-    with written(path) as file:
-        file.write((json.dumps(content, indent=1, default=float) + "\n").encode())
+    save_text(path, json.dumps(content, indent=1, default=float) + "\n")
 
 
 def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
@@ -56,3 +60,23 @@ def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
     with written(path) as file:
         np.savez_compressed(file, **content)
+
+
+def _remove_stale_parts(path: Path) -> None:
+    for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
+        process = part.name.removeprefix(f".{path.name}.").removesuffix(".part")
+        if process.isdecimal() and not _runs(int(process)):
+            part.unlink(missing_ok=True)
+
+
+def _runs(process: int) -> bool:
+    """Returns whether a process may be running; on Windows the signal 0 would end it."""
+    if os.name == "nt":
+        return True
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except PermissionError:
+        pass
+    return True
