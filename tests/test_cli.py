@@ -1,6 +1,7 @@
 """The command line: the files and keys that other people's scripts rely on, and one line for whatever goes wrong."""
 
 import json
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import show
+from distrace.cli.console import progress
 from distrace.data.observation import View, load_view, save_view
 from distrace.data.samples import write_samples
 from distrace.rays import meet_sphere
@@ -417,7 +419,11 @@ BAD = [
     ("render {model} --sensor-mm -1", "focal length"),
     ("render {model} --azimuth nan", "nan"),
     ("render {model} --distance 0", "its own place"),
+    ("render {model} --distance -3", "--distance -3.0 was given; it cannot be negative"),
     ("render {model} --strategy slow", "--strategy"),
+    ("render {model} --colour a[/y]z", "a[/y]z"),
+    ("render {tmp}/a[/y]z", "a[/y]z is neither a folder nor a bundled model"),
+    ("pose {model} {view} --azimuth 0 --distance -3", "--distance -3.0 was given"),
     ("render {model} --device tpu", "--device tpu is no device"),
     ("render {model} --device mps", "--device mps is not supported"),
     ("mesh {model} --resolution 3", "resolution of 3"),
@@ -534,3 +540,32 @@ def test_a_bug_is_not_hidden_behind_one_line(
     monkeypatch.setattr(show.Mesh, "run", broken)
     with pytest.raises(RuntimeError, match="mat1"):
         run("mesh", model, "--out", tmp_path)
+
+
+def test_names_that_look_like_markup_are_printed_as_they_are(
+    model: Path, run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
+) -> None:
+    for name in ("x[final]", "x[/y]z", ":smile:"):
+        run("mesh", model, "--resolution", 8, "--out", tmp_path / name)
+        assert f"wrote {tmp_path / name} in" in capsys.readouterr().out
+    with progress("[/a]", 1) as bar:
+        bar.advance("[/b] :smile:")
+    assert "[/b] :smile:" in capsys.readouterr().out
+
+
+def test_a_closed_pipe_ends_what_is_printed_not_the_command(model: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "distrace", "render", str(model), "--out", str(tmp_path), *VIEW]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout
+    assert process.stderr
+    process.stdout.close()
+    assert process.stderr.read() == ""
+    assert process.wait() == 0
+    assert result(tmp_path, "evaluations")["evaluations"] > 0
+
+
+def test_a_camera_refuses_sizes_that_are_no_whole_numbers() -> None:
+    program = "import distrace; distrace.Camera.orbit(0, 0, 2, height=2.5)"  # a process without checks of types
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    sentence = "ValueError: an image of 2.5 × 512 pixels was asked for; both must be whole numbers from 1"
+    assert done.stderr.splitlines()[-1] == sentence

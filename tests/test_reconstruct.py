@@ -402,7 +402,7 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
 ) -> None:
     monkeypatch.setattr("distrace.cli.reconstruct.ReconstructConfig", partial(ReconstructConfig, initial_steps=150))
     monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 2)
-    monkeypatch.setattr("distrace.cli.reconstructed.TOLD", 1)
+    monkeypatch.setattr("distrace.cli.reconstructed.FITTED_SHOWN", 1)
     monkeypatch.setattr("distrace.reconstruction.cameras.STEPS", 5)
     placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))

@@ -1,33 +1,114 @@
-"""What `import distrace` and `python -m distrace` bring with them: threads that let others run, and nothing slow."""
+"""How the package and the command line start: quickly, and without the libraries that are not used yet."""
 
 import os
 import subprocess
 import sys
+from importlib.metadata import version
+from pathlib import Path
 
 import pytest
 
+import distrace
+import distrace.public
+from distrace.cli import COMMANDS, Lazy
+
+HEAVY = {
+    *("trimesh", "scipy", "skimage", "PIL", "matplotlib", "plotly"),
+    *("igl", "embreex", "manifold3d", "pycolmap", "av", "torch._dynamo"),
+}
 WAITED = "import os, distrace; print(os.environ['GOMP_SPINCOUNT'])"
+NOTHING = "import distrace"
+EVERYTHING = "import distrace.public; from distrace.cli import COMMANDS; [each.loaded() for each in COMMANDS.values()]"
+HELP = """
+import sys
+from distrace.cli import main
+sys.argv = ["distrace", "--help"]
+try:
+    main()
+except SystemExit:
+    pass
+"""
+
+
+def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+
+
+def loaded(program: str) -> list[str]:
+    """The modules that a program loads, in their order."""
+    done = python("-c", f"{program}\nimport sys\nprint(*sys.modules)")
+    assert done.returncode == 0, done.stderr[-500:]
+    return done.stdout.splitlines()[-1].split()
 
 
 @pytest.fixture(scope="module")
-def loaded() -> list[str]:
-    """The modules that starting the command line loads, in their order."""
-    command = [sys.executable, "-X", "importtime", "-m", "distrace", "--help"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert "usage: distrace" in done.stdout
-    return [line.rsplit("|")[-1].strip() for line in done.stderr.splitlines()]
+def modules() -> list[str]:
+    """The modules that all public names and all commands load."""
+    return loaded(EVERYTHING)
 
 
-def test_how_long_threads_spin_is_said_before_torch_reads_it(loaded: list[str]) -> None:
-    assert loaded.index("distrace.threads") < loaded.index("torch._C")
+def test_threads_are_set_before_torch_reads_how_long_they_spin(modules: list[str]) -> None:
+    assert modules.index("distrace.threads") < modules.index("torch._C")
 
 
-def test_no_compiler_is_loaded(loaded: list[str]) -> None:
-    assert "distrace.cli" in loaded
-    assert "torch._dynamo" not in loaded, "a third of the time that a command takes to start"
+def test_neither_public_names_nor_commands_load_heavy_libraries(modules: list[str]) -> None:
+    assert {"distrace.cli.reconstruct", "distrace.cli.train", "distrace.report.scene"} <= set(modules)
+    assert HEAVY & set(modules) == set()
+
+
+@pytest.mark.parametrize("program", [NOTHING, HELP])
+def test_importing_the_package_or_asking_for_help_loads_no_torch(program: str) -> None:
+    modules = set(loaded(program))
+    assert "distrace" in modules
+    assert (HEAVY | {"torch", "numpy"}) & modules == set()
+
+
+def test_public_names_are_attributes_of_the_package_and_render_is_the_function() -> None:
+    public = {name for name in vars(distrace.public) if not name.startswith("_")}
+    assert public <= set(dir(distrace))
+    assert all(getattr(distrace, name) is getattr(distrace.public, name) for name in public)
+    assert callable(distrace.render)
+    assert distrace.fields.base.SDF is distrace.SDF
+    with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
+        getattr(distrace, "nothing")  # noqa: B009
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_summary_is_the_first_sentence_of_the_command(name: str) -> None:
+    command = COMMANDS[name]
+    assert isinstance(command, Lazy)
+    assert (command.loaded().__doc__ or "").split("\n")[0] == command.summary
 
 
 def test_what_the_user_said_stays() -> None:
-    environment = os.environ | {"GOMP_SPINCOUNT": "7"}
-    said = subprocess.run([sys.executable, "-c", WAITED], capture_output=True, text=True, check=True, env=environment)
-    assert said.stdout.strip() == "7"
+    assert python("-c", WAITED, GOMP_SPINCOUNT="7").stdout.strip() == "7"
+
+
+def test_it_says_its_version() -> None:
+    assert python("-m", "distrace", "--version").stdout == f"distrace {version('distrace')}\n"
+
+
+def test_help_is_printed_in_any_encoding() -> None:
+    done = python("-m", "distrace", "--help", PYTHONIOENCODING="ascii")
+    assert done.returncode == 0
+    assert "check-gradients" in done.stdout
+
+
+def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
+    interrupting = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(20)"
+    (tmp_path / "torch.py").write_text(interrupting)
+    path = os.pathsep.join([str(tmp_path), str(Path(distrace.__file__).parents[1])])
+    done = python("-m", "distrace", "mesh", "sofas", PYTHONPATH=path)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "distrace: interrupted\n")
+
+
+def test_help_into_a_closed_pipe_is_quiet() -> None:
+    process = subprocess.Popen(
+        [sys.executable, "-m", "distrace", "--help"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout
+    process.stdout.close()
+    assert process.stderr
+    assert process.stderr.read() == ""
+    assert process.wait() == 0

@@ -3,12 +3,14 @@
 import io
 import os
 import re
+import signal
 import sys
-from collections.abc import Mapping
-from contextlib import redirect_stderr
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, make_dataclass
 from importlib import import_module
 from importlib.metadata import version
+from threading import current_thread, main_thread
 from typing import Any
 
 from distrace.optional import MissingLibrary
@@ -57,7 +59,8 @@ COMMANDS: Commands = {
 }
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
-RUNNING = "interrupted; every written file is complete, and sample, train and reconstruct continue when run again"
+INTERRUPTED = "interrupted"
+RUNNING = f"{INTERRUPTED}; every written file is complete, and sample, train and reconstruct continue when run again"
 
 
 def main() -> None:
@@ -68,9 +71,10 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
     """Runs what the command line says; exits the process where that fails."""
     sys.argv[0] = program  # as recorded tables name it
     _print_any_character()
-    interrupted = "interrupted"
+    interrupted = INTERRUPTED
     try:
-        command = parsed(sys.argv[1:], commands, program, about)
+        with _leaving_at_interrupts(program):
+            command = parsed(sys.argv[1:], commands, program, about)
         interrupted = RUNNING
         command.run()
         sys.stdout.flush()
@@ -118,6 +122,25 @@ def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "
 def discard_output() -> None:
     """Sends what is still printed nowhere, for the process that read it is gone."""
     os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+@contextmanager
+def _leaving_at_interrupts(program: str) -> Iterator[None]:
+    """Ctrl-C ends the process at once: an exception can be lost in libraries that are being imported."""
+
+    def leave(*_: object) -> None:
+        os.write(2, f"{program}: {INTERRUPTED}\n".encode())
+        os._exit(130)
+
+    handler = signal.getsignal(signal.SIGINT)
+    if handler is not signal.default_int_handler or current_thread() is not main_thread():
+        yield
+        return
+    signal.signal(signal.SIGINT, leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, handler)
 
 
 def _print_any_character() -> None:

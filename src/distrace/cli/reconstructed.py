@@ -25,7 +25,7 @@ from distrace.shading import grid, save_png
 if TYPE_CHECKING:
     import trimesh
 
-TOLD = 4  # views that were fitted to, on the page
+FITTED_SHOWN = 4  # views that were fitted to, on the page
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Reconstructed:
         return moved(view, rigid_motions(step[None])[0])
 
     def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[Judged]) -> None:
-        examples = self._judged(self._refined[:: -(-len(self._refined) // TOLD)])
+        examples = self._judged(self._refined[:: -(-len(self._refined) // FITTED_SHOWN)])
         facts = {
             "views": f"{len(self.fitted_to)}, and {len(held_out)} held out",
             "steps": f"{self.state.step:,} of {self.config.rays} rays",

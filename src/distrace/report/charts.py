@@ -1,4 +1,4 @@
-"""Charts in a page, as SVG in the colours of the page's text."""
+"""Charts of a page, as SVG in the colour of the page's text."""
 
 import io
 import re
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PALETTE = ("#4477aa", "#ee7733", "#228833", "#cc3377", "#8866cc", "#0099aa", "#aa8811", "#888888")
-THEME_INK = "#010203"  # stands in a chart for the colour of the page's text
+THEME_INK = "#010203"  # replaced by the colour of the page's text
 STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "distrace", "font.size": 10.5} | dict.fromkeys(
     ("text.color", "axes.labelcolor", "axes.edgecolor", "xtick.color", "ytick.color"), THEME_INK
 )
@@ -24,7 +24,7 @@ STYLE: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "distrace", "fo
 def curves(
     series: Mapping[str, Sequence[float]], x_label: str, y_label: str, log: bool, emphasised: str | None = None
 ) -> Html:
-    """Curves over the steps 1, 2, …; the others step back from an emphasised one."""
+    """Returns curves over the steps 1, 2, …; one of them may be emphasised."""
     chart, axes = _empty("y")
     for i, (name, values) in enumerate(series.items()):
         leads = emphasised in (None, name)
@@ -38,7 +38,7 @@ def curves(
 
 
 def growth(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: str) -> Html:
-    """How values grow with x, both on logarithmic axes; each x is marked."""
+    """Returns values over x on logarithmic axes, with a tick at each x."""
     chart, axes = _lines(series)
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
     axes.set_xticks(sorted({x for points in series.values() for x in points}), minor=False)
@@ -48,14 +48,14 @@ def growth(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: s
 
 
 def courses(series: Mapping[str, Mapping[float, float]], x_label: str, y_label: str) -> Html:
-    """How values fall with x, both on logarithmic axes; the end of each is marked."""
+    """Returns values over x on logarithmic axes, with a mark at the end of each curve."""
     chart, axes = _lines(series, markevery=[-1])
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
     return _drawn(chart)
 
 
 def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
-    """A PNG of values, one for each so many steps, on logarithmic axes."""
+    """Writes a PNG of values, one for `every` steps each, on logarithmic axes."""
     require("a chart", "matplotlib")
     from matplotlib import rc_context
     from matplotlib.figure import Figure
@@ -71,14 +71,14 @@ def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y
 
 
 def steps_chart(series: Mapping[str, Mapping[str, float]], x_label: str, y_label: str) -> Html:
-    """Values over named steps, from zero."""
+    """Returns values over named steps; the axis starts at zero."""
     chart, axes = _lines(series)
     axes.set(xlabel=x_label, ylabel=y_label, ylim=(0, None))
     return _drawn(chart)
 
 
 def bars(values: Mapping[str, float], x_label: str) -> Html:
-    """One bar per name, from above, on a logarithmic axis, with its value beside it."""
+    """Returns one bar for each name, the first on top, on a logarithmic axis, with its value."""
     chart, axes = _empty("x", height=0.42 * len(values) + 0.9)
     names = [_plain(name) for name in values]
     drawn = axes.barh(names, list(values.values()), color=PALETTE[0], height=0.62)
@@ -89,7 +89,7 @@ def bars(values: Mapping[str, float], x_label: str) -> Html:
 
 
 def _lines(series: Mapping[str, Mapping[Any, float]], **style: Any) -> "tuple[Figure, Axes]":
-    """Each series by its x, all named below."""
+    """Returns a chart of each series over its x, with a legend below."""
     chart, axes = _empty("both")
     for i, (name, points) in enumerate(series.items()):
         colour = PALETTE[i % len(PALETTE)]

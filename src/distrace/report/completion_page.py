@@ -1,4 +1,4 @@
-"""The page of a completed shape: what was observed, what was made of it, and how far that is from the truth."""
+"""The page of a completed shape: the observation, the fitted shape and its errors."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from distrace.shading import Picture
 if TYPE_CHECKING:
     import trimesh
 
-DENSE = 0.05  # the share of pixels with a depth above which dots would hide each other
+DENSE = 0.05  # share of pixels with a depth, above which dots would hide each other
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class View:
 
 @dataclass(frozen=True)
 class Completion:
-    """A shape fitted to one depth view, with all that its page shows; what is not known is None."""
+    """The content of the page of a shape that was fitted to one depth view; what is unknown is None."""
 
     title: str
     observed_depth: Float[np.ndarray, "height width"]  # inf where there is none
@@ -54,12 +54,12 @@ class Completion:
     truth_points: Float[np.ndarray, "m 3"] | None
     chamfer: Chamfer | None
     facts: dict[str, str]
-    others: Sequence[Sequence[Picture]] = ()  # from the camera and from behind: how far others are apart, and each
-    chosen: str | None = None  # the name of the curve whose result is shown
+    others: Sequence[Sequence[Picture]] = ()  # rows from the camera and from behind: the spread, then each
+    chosen: str | None = None  # the curve whose result is shown
 
 
 def completion_page(completion: Completion) -> str:
-    """What was observed, what was made of it, and how far that is from the truth."""
+    """Returns the page as HTML."""
     count = f"{len(completion.points_world):,}"
     lead = f"A whole surface from {count} points: what was observed, the fitted shape and its errors."
     sections = [
@@ -100,7 +100,7 @@ def _observed(completion: Completion) -> Html:
 
 
 def _under_points(completion: Completion) -> tuple[Picture, str]:
-    """What the dots are drawn over, and how to say so."""
+    """Returns the picture under the dots, and its words in the caption."""
     if completion.truth is not None:
         return completion.truth.shaded, ", over a picture of the true surface"
     if completion.observed_mask is not None:
@@ -116,8 +116,8 @@ def _space(completion: Completion) -> Html:
     clouds = {"Observed points": completion.points_world}
     if completion.truth_points is not None:
         clouds["Points of the true surface"] = completion.truth_points
-    how = "Drag to turn. The buttons switch to moving and zooming, the legend hides and shows."
-    return section("In space", paragraph(how), scene({"Completed surface": completion.mesh}, clouds))
+    usage = "Drag to turn. Buttons switch to moving and zooming; the legend hides and shows."
+    return section("In space", paragraph(usage), scene({"Completed surface": completion.mesh}, clouds))
 
 
 def _distances(chamfer: Chamfer) -> Html:
@@ -126,7 +126,7 @@ def _distances(chamfer: Chamfer) -> Html:
         " in the frame in which the shape lies in the unit sphere."
     )
     rows = [
-        ("Completed to true", f"{chamfer.to:.4f}", "Large where there is surface that should not be there."),
+        ("Completed to true", f"{chamfer.to:.4f}", "Large where surface is extra."),
         ("True to completed", f"{chamfer.from_:.4f}", "Large where surface is missing."),
         ("Sum", f"{chamfer.sum:.4f}", "Both errors together."),
     ]
@@ -160,7 +160,7 @@ def _depths(completion: Completion) -> Html:
 
 
 def _depth_errors(completion: Completion) -> list[Html]:
-    """What the rendered depths are off by, where the true depth is known at every pixel."""
+    """Returns pictures of the errors in depth; none without the true depth."""
     if completion.truth is None:
         return []
     before, after = (_difference(view.depth, completion.truth.depth) for view in (completion.before, completion.after))
@@ -171,7 +171,7 @@ def _depth_errors(completion: Completion) -> list[Html]:
 
 
 def _difference(depth: Float[np.ndarray, "h w"], truth: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """NaN where one of them is not finite."""
+    """Returns depth − truth; NaN where one of them is not finite."""
     return np.subtract(depth, truth, out=np.full_like(depth, np.nan), where=np.isfinite(depth) & np.isfinite(truth))
 
 
@@ -194,14 +194,14 @@ def _normals(completion: Completion) -> Html:
 
 def _others(completion: Completion) -> Html:
     about = (
-        "Each is fitted to the same observation, from another guess of what was not seen. Coloured: how far their"
-        " surfaces are from the completed one, in radii of the sphere; the lower row is seen from behind."
+        "Each is fitted to the same observation, with another guess of the unobserved parts. Colours show how far these"
+        " surfaces are from the completed one, in radii of the sphere. The lower row is the view from behind."
     )
     colours = shading.error_picture(np.linspace(0, 1, 9)[None], 1)
     return section(
         "Other shapes that fit",
         paragraph(about),
-        figure(shading.grid(completion.others), "How far apart, and the others"),
+        figure(shading.grid(completion.others), "Spread, and the other shapes"),
         ramp("0", "0.1 and more", colours),
     )
 

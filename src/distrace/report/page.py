@@ -1,6 +1,6 @@
-"""Pages of one HTML file: pictures and tables, with all that they need inside; charts and 3-D views are apart.
+"""Pages of one self-contained HTML file: text, pictures and tables.
 
-Functions take plain text and escape it; what they return, `Html`, goes into others as it is.
+Functions escape the plain text that they take. They return `Html`, which other functions insert unchanged.
 """
 
 import base64
@@ -17,7 +17,7 @@ from distrace.shading import Colour, Picture
 
 Html = NewType("Html", str)
 
-NUMBER = re.compile(r"–?|[-+−]?[\d.,]+(e[-+]?\d+)?\s?%?")  # or none
+NUMBER = re.compile(r"–?|[-+−]?[\d.,]+(e[-+]?\d+)?\s?%?")  # an empty cell and a dash count as numbers
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c2128; --soft: #616b78; --paper: #fbfbfa; --card: #fff; --line: #e3e5e8; }
@@ -69,7 +69,7 @@ for (const view of document.querySelectorAll(".scene")) {
 
 
 def page(title: str, lead: str, sections: Sequence[Html]) -> str:
-    """A whole document. Its policy forbids the browser to load anything; plotly is inside where there is a 3-D view."""
+    """Returns a document. Its policy forbids the browser to load anything; a page with a 3-D view includes Plotly."""
     body = "\n".join(sections)
     scripts = ""
     if '<div class="scene"' in body:
@@ -107,7 +107,7 @@ def paragraph(text: str) -> Html:
 
 
 def figure(picture: Picture, caption: str) -> Html:
-    """A picture with its caption; one of few pixels is shown with its pixels."""
+    """Returns a picture with its caption; a small picture is enlarged without smoothing."""
     from PIL import Image
 
     encoded = io.BytesIO()
@@ -124,7 +124,7 @@ def row(*figures: Html) -> Html:
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
-    """A table, its columns of numbers to the right; without a head where the header is empty."""
+    """Returns a table; columns of numbers are right-aligned, and an empty header is omitted."""
     numeric = [all(NUMBER.fullmatch(cell) for cell in column) for column in zip(*rows)] or [False] * len(header)
     head = f"<thead>{_line('th', header, numeric)}</thead>" if any(header) else ""
     lines = "".join(_line("td", line, numeric) for line in rows)
@@ -132,20 +132,24 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
 
 
 def short(value: object) -> str:
-    """A value as a cell: counts with separators, other numbers in as few digits as tell."""
+    """Returns a value as text: counts with separators, other numbers with five digits.
+
+    >>> short(12345), short(0.00123), short(1.5)
+    ('12,345', '1.2e-03', '1.5')
+    """
     if isinstance(value, float):
         return f"{value:.1e}" if 0 < abs(value) < 0.01 else f"{value:.5g}"
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def key(colours: Mapping[str, Colour]) -> Html:
-    """What the colours of a picture mean."""
+    """Returns the legend of a picture's colours."""
     entries = (f'<span><i style="background:rgb{colour}"></i>{escape(name)}</span>' for name, colour in colours.items())
     return Html('<div class="key">' + "".join(entries) + "</div>")
 
 
 def ramp(first: str, last: str, colours: UInt8[np.ndarray, "1 n 3"]) -> Html:
-    """What the colours of a picture mean where they change evenly."""
+    """Returns the legend of a continuous range of colours."""
     stops = ", ".join(f"rgb({r}, {g}, {b})" for r, g, b in colours[0].tolist())
     style = f"background:linear-gradient(90deg, {stops})"
     return Html(

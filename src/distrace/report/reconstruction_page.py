@@ -1,4 +1,4 @@
-"""What a reconstruction looks like beside photographs that it was not told: pictures, figures, a page."""
+"""The page of a reconstruction: renderings beside photographs, held-out ones first, and their errors."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -28,16 +28,16 @@ from distrace.training.losses import COURSE
 if TYPE_CHECKING:
     import trimesh
 
-AT_ONCE = 1 << 16  # points whose colours are asked for
-FINER = 2  # rays across a pixel: photographs have means over areas
+AT_ONCE = 1 << 16  # points whose colours are evaluated together
+FINER = 2  # rays along each side of a pixel: a photograph has means over areas
 
 
 @dataclass(frozen=True)
 class Judged:
-    """A photograph and its rendering: how far apart they are, and how they look side by side."""
+    """A photograph and its rendering: their difference, and both side by side."""
 
     name: str
-    psnr: float  # in decibels, over the pixels of the photograph's mask; object that is missing counts as black
+    psnr: float  # decibels, over the photograph's mask; pixels that are not rendered count as black
     silhouette_iou: float
     picture: Picture  # the photograph, the rendering, its normals, the masks
 
@@ -65,13 +65,16 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
 def seen(
     state: Reconstruction, view: Photograph
 ) -> tuple[Buffers, Bool[Tensor, "height width"], Float[Tensor, "height width 3"]]:
-    """The surface before a photograph's camera, `FINER` in each direction; pixels of which it covers more than half;
-    and their colours, as a camera has them: means over a pixel's area, of which what is not hit is black."""
+    """Renders the surface as a photograph's camera sees it.
+
+    Returns the buffers, `FINER` rays along each side of a pixel; the pixels that are covered by more than half; and
+    their colours, means over a pixel's area in which rays that miss are black.
+    """
     camera = view.camera.resized(float(FINER)).to(state.device)
     buffers = render(state.surface, camera)
     made = torch.zeros_like(buffers.rays.directions)
     hits = zip(buffers.points.split(AT_ONCE), buffers.rays.directions[buffers.mask].split(AT_ONCE), strict=True)
-    parts = [surface_colours(state.surface, state.colour, *some) for some in hits]
+    parts = [surface_colours(state.surface, state.colour, points, directions) for points, directions in hits]
     made[buffers.mask] = torch.cat(parts) if parts else made[:0, 0]
     covered = averaged(buffers.mask[..., None].cpu().float(), 1 / FINER)[..., 0]
     return buffers, covered > 0.5, averaged(made.cpu(), 1 / FINER).float()
@@ -79,7 +82,7 @@ def seen(
 
 @torch.no_grad()
 def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh":
-    """The surface as triangles; each vertex has the colour that it shows when looked at from straight above."""
+    """Returns the surface as triangles; each vertex has the colour that is seen along its normal."""
     import trimesh
 
     mesh = extract_mesh(state.surface, config)
@@ -93,8 +96,10 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh
 
 
 def row_of(name: str, method: str, judgements: Mapping[str, Sequence[Judged]], seconds: float) -> dict[str, object]:
-    """A row of the table of photographs: means over views that were held out, for each of some cameras; what these are
-    called follows the names of the numbers."""
+    """Returns a row of the table of photographs: means over held-out views.
+
+    Each key of `judgements` names the cameras, and is appended to the columns' names.
+    """
     numbers: dict[str, object] = {}
     for cameras, views in judgements.items():
         numbers[f"psnr{cameras}"] = round(mean(view.psnr for view in views), 2)
@@ -106,21 +111,21 @@ def row_of(name: str, method: str, judgements: Mapping[str, Sequence[Judged]], s
 def reconstruction_page(
     name: str,
     held_out: Sequence[Judged],
-    told: Sequence[Judged],
+    fitted_to: Sequence[Judged],
     course: Mapping[str, Sequence[float]],
     mesh: "trimesh.Trimesh",
     facts: Mapping[str, str],
 ) -> str:
-    """Views that were held out, some that were not, the mesh, and the course of the loss."""
-    about = "The photograph, what is not object dimmed; the rendering; its normals; masks, orange missing, blue extra."
+    """Returns a page with held-out views, views that were fitted to, the mesh and the loss history."""
+    about = "The photograph, its background dimmed; the rendering; its normals; the masks (orange missing, blue extra)."
     return page(
         f"{name} from photographs",
         "A surface and its colours, as the weights of two networks: sphere-traced, with exact gradients.",
         [
             *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
-            section("Views it was fitted to", *map(_shown, told)),
+            section("Views that were fitted to", *map(_shown, fitted_to)),
             section("In space", scene({"Surface": mesh}, {})),
-            section("Course", curves(course, f"× {COURSE} steps", "mean of a term", True)),
+            section("Loss", curves(course, f"× {COURSE} steps", "mean of a term", True)),
             section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
         ],
     )

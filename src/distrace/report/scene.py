@@ -1,4 +1,4 @@
-"""3-D views in a page, to turn with the mouse."""
+"""Interactive 3-D views of a page."""
 
 import math
 from collections.abc import Mapping
@@ -25,9 +25,9 @@ MARGIN = 1.08
 
 
 def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray]) -> Html:
-    """A view to turn, y up, in the colours of the meshes' vertices where they have some.
+    """Returns an interactive view of meshes and clouds, y up; vertices keep their colours.
 
-    Each name stands in the legend, which hides and shows it.
+    The legend lists each name, and hides or shows it.
     """
     require("a 3-D view", "plotly")
     import plotly.graph_objects as go
@@ -52,7 +52,7 @@ def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarr
 
 
 def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """From where the box of all points fits into the picture; plotly's unit is the geometric mean of its sides."""
+    """Returns the eye from which the points' box fills the view; Plotly's unit is the geometric mean of its sides."""
     sides = np.ptp(_turned(points), axis=0) if len(points) else np.ones(3)
     sides = np.maximum(sides, 0.01 * max(sides.max(), 1e-9))
     corners = sides / np.prod(sides) ** (1 / 3) * (np.indices((2, 2, 2)).reshape(3, 8).T - 0.5)
@@ -83,7 +83,7 @@ def _surface(name: str, mesh: "trimesh.Trimesh") -> "go.Mesh3d":
 
 
 def _own_colours(mesh: "trimesh.Trimesh") -> np.ndarray:
-    """Red, green and blue of each vertex; no columns where a mesh has none."""
+    """Returns red, green and blue of each vertex, or no columns for a mesh without colours."""
     from trimesh.visual import ColorVisuals
 
     visual = mesh.visual
@@ -95,9 +95,9 @@ def _own_colours(mesh: "trimesh.Trimesh") -> np.ndarray:
 def _cloud(name: str, points: np.ndarray, colour: str) -> "go.Scatter3d":
     import plotly.graph_objects as go
 
-    some = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
-    dot = dict(size=1.8 if len(some) > 1000 else 4, color=colour)
-    return go.Scatter3d(**_coordinates(some), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")
+    sparse = points[:: max(1, math.ceil(len(points) / MOST_POINTS))]
+    dot = dict(size=1.8 if len(sparse) > 1000 else 4, color=colour)
+    return go.Scatter3d(**_coordinates(sparse), mode="markers", marker=dot, name=escape(name), hoverinfo="skip")
 
 
 def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
@@ -105,16 +105,16 @@ def _coordinates(points: Float[np.ndarray, "n 3"]) -> dict[str, np.ndarray]:
 
 
 def _turned(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """World z, x, y as plotly's x, y, z: its turntable turns around its z alone."""
+    """Returns world z, x, y as Plotly's x, y, z: its turntable turns around z only."""
     return points[:, [2, 0, 1]]
 
 
 def _decimated(
     vertices: Float[np.ndarray, "n columns"], faces: Int[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "_ columns"], Int[np.ndarray, "_ 3"]]:
-    """A surface of at most `MOST_FACES`: vertices of one cell of a grid become one (Rossignac and Borrel, 1993).
+    """Returns a surface of at most `MOST_FACES`, by vertex clustering (Rossignac and Borrel, 1993).
 
-    Whatever else the columns hold than places is averaged with them.
+    All columns of the vertices in one cell of a grid are averaged: positions, and colours where there are some.
     """
     width = np.ptp(vertices[:, :3], axis=0).max() / 160 if len(faces) > MOST_FACES else 0.0
     corners, triangles = vertices, faces

@@ -1,4 +1,4 @@
-"""The page of a shape found in photographs: each of them beside what was made of it, and how the shape formed."""
+"""The page of a shape fitted to photographs: photographs beside renderings, and a film of the fit."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -23,9 +23,9 @@ from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
 if TYPE_CHECKING:
     import trimesh
 
-SHOWN = 8  # views
-SIZE = 224  # pixels, of pictures
-FRAMES = 24  # of the film of the shape forming
+SHOWN = 8  # views on the page
+SIZE = 224  # pixels along a picture's longer side
+FRAMES = 24  # of the film
 
 
 def views_page(
@@ -35,21 +35,23 @@ def views_page(
     agreed: Sequence[ViewAgreement],
     mesh: "trimesh.Trimesh",
 ) -> str:
-    """Photographs with the outline of the fitted shape, the shape, and what each view is off by."""
+    """Returns a page with photographs under the outline of the fitted shape, the shape, and each view's error."""
     last = steps[-1]
-    some = views[:: -(-len(views) // SHOWN)]
-    pictures = [figure(_beside(model, last, view), view.name) for view in some]
+    examples = views[:: -(-len(views) // SHOWN)]
+    pictures = [figure(_beside(model, last, view), view.name) for view in examples]
     losses: dict[str, list[float]] = {}
     for step in steps:
         losses.setdefault(step.name, []).append(step.loss)
     cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.is_outlier else ""] for view in agreed]
-    lead = f"A shape from {len(views)} photographs, by the model {model.name}. No depth was known."
-    about = "How far colours, from 0 to 1, are from those of the same points in other views: the median."
+    lead = f"A shape from {len(views)} photographs without depth, by the model {model.name}."
+    about = "Median difference of colours, from 0 to 1, between a view and the other views of the same points."
     return page(
         "A shape from photographs",
         lead,
         [
-            section("Views", paragraph("Each with the outline of the shape, and the shape."), row(*pictures)),
+            section(
+                "Views", paragraph("Each photograph with the outline of the shape, and the shape."), row(*pictures)
+            ),
             section("In space", scene({"Shape": mesh}, {})),
             section("Loss", curves(losses, "iteration", "loss", True, last.name)),
             section("Agreement", paragraph(about), table(["view", "colour", ""], cells)),
@@ -58,15 +60,15 @@ def views_page(
 
 
 def forming(model: Model, steps: Sequence[PhotoStep], camera: Camera) -> UInt8[np.ndarray, "frames height width 3"]:
-    """The shape after the steps of the start that was chosen, as a camera sees it."""
-    chosen = [step for step in steps if step.start == steps[-1].start]
-    some = chosen[:: -(-len(chosen) // FRAMES)]
-    pictures = [View.of(_rendered(model, step, camera)).shaded for step in [*some, chosen[-1]]]
+    """Returns renderings of the shape during the best start of the fit, the last step included."""
+    best = [step for step in steps if step.start == steps[-1].start]
+    frames = [*best[:: -(-len(best) // FRAMES)], best[-1]]
+    pictures = [View.of(_rendered(model, step, camera)).shaded for step in frames]
     return np.stack(pictures)
 
 
 def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
-    """The photograph with the outline of the shape, and the shape."""
+    """Returns the photograph with the outline of the shape, beside the shape."""
     small = view.at_most(SIZE)
     buffers = _rendered(model, step, view.camera)
     picture = colour_picture(small.image.cpu())
