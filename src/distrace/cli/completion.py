@@ -162,7 +162,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         others=_other_pictures(task, outcome) if outcome.others else [],
         losses=losses,
         mesh=outcome.mesh,
-        truth_points=getattr(task.truth, "vertices", task.truth),
+        truth_points=task.truth if isinstance(task.truth, np.ndarray | None) else task.truth.vertices,
         chamfer=outcome.chamfer,
         facts=facts,
         chosen=outcome.steps[-1].name,

@@ -49,9 +49,7 @@ def views_page(
         "A shape from photographs",
         lead,
         [
-            section(
-                "Views", paragraph("Each photograph with the outline of the shape, and the shape."), row(*pictures)
-            ),
+            section("Views", paragraph("Photographs with the shape's outline, and the shape."), row(*pictures)),
             section("In space", scene({"Shape": mesh}, {})),
             section("Loss", curves(losses, "iteration", "loss", True, last.name)),
             section("Agreement", paragraph(about), table(["view", "colour", ""], cells)),
