@@ -126,7 +126,7 @@ def _distances(chamfer: Chamfer) -> Html:
         " in the frame in which the shape lies in the unit sphere."
     )
     rows = [
-        ("Completed to true", f"{chamfer.to:.4f}", "Large where surface is extra."),
+        ("Completed to true", f"{chamfer.to:.4f}", "Large where there is surface that should not be there."),
         ("True to completed", f"{chamfer.from_:.4f}", "Large where surface is missing."),
         ("Sum", f"{chamfer.sum:.4f}", "Both errors together."),
     ]
