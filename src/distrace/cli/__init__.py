@@ -9,10 +9,10 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, make_dataclass
 from importlib import import_module
-from importlib.metadata import version
 from threading import current_thread, main_thread
 from typing import Any
 
+import distrace
 from distrace.optional import MissingLibrary
 
 
@@ -95,7 +95,7 @@ def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "
     import tyro
 
     if arguments == ["--version"]:
-        print(program, version("distrace"), flush=True)
+        print(program, distrace.__version__, flush=True)
         sys.exit()
     message = io.StringIO()
     try:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import tyro
@@ -97,7 +97,7 @@ def _reference(path: Path) -> "trimesh.Trimesh | np.ndarray":
     import trimesh
 
     with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
-        loaded = load_geometry(path)
+        loaded: Any = load_geometry(path)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         vertices = np.asarray(loaded.vertices, dtype=np.float64)

@@ -6,7 +6,6 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +21,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
+import distrace
 from distrace.cli import discard_output
 from distrace.errors import DoubtfulResult, explained
 from distrace.files import save_json
@@ -89,7 +89,7 @@ class Run:
         common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
         if "evaluations" in facts:
             common["setup_evaluations"] = 0  # unless facts say otherwise
-        content = {**common, "version": version("distrace"), "warnings": self.warnings, **facts}
+        content = {**common, "version": distrace.__version__, "warnings": self.warnings, **facts}
         save_json(self.out / "result.json", content)
         for line in lines:
             console.print(line)
