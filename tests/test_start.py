@@ -64,9 +64,8 @@ def test_importing_the_package_or_asking_for_help_loads_no_torch(program: str) -
 
 
 def test_public_names_are_attributes_of_the_package_and_render_is_the_function() -> None:
-    public = {name for name in vars(distrace.public) if not name.startswith("_")}
-    assert public <= set(dir(distrace))
-    assert all(getattr(distrace, name) is getattr(distrace.public, name) for name in public)
+    assert distrace.__all__ == dir(distrace) == distrace.public.__all__
+    assert all(getattr(distrace, name) is getattr(distrace.public, name) for name in distrace.__all__)
     assert callable(distrace.render)
     assert distrace.fields.base.SDF is distrace.SDF
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
@@ -85,7 +84,7 @@ def test_what_the_user_said_stays() -> None:
 
 
 def test_it_says_its_version() -> None:
-    assert python("-m", "distrace", "--version").stdout == f"distrace {version('distrace')}\n"
+    assert python("-m", "distrace", "--version").stdout == f"distrace {distrace.__version__}\n"
 
 
 def test_help_is_printed_in_any_encoding() -> None:
