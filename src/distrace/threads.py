@@ -9,14 +9,14 @@ cost nothing measurable; 2,000 cost 10 %.
 """
 
 import os
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 
 os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 
 @contextmanager
-def flushed_denormals() -> Iterator[None]:
+def flushed_denormals() -> Generator[None, None, None]:
     """Denormal numbers count as zero inside. Adam's averages decay into them: training was 2.3 times slower."""
     import torch
 

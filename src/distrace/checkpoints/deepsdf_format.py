@@ -7,6 +7,7 @@ import pickle
 import re
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from distrace.files import written
 LATEST = "latest.pth"
 BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
 SPLINES = "latent_fields_state_dict"
-PICKLED = np.zeros(1).__reduce__()[0], np.float64(0).__reduce__()[0]  # functions that make an array and a scalar
+PICKLED: tuple[Any, Any] = (np.zeros(1).__reduce__()[0], np.float64(0).__reduce__()[0])  # of an array and a scalar
 NUMPY = [np.ndarray, np.dtype, *{type(np.dtype(kind)) for kind in "?bBhHiIlLqQefd"}]
 NUMPY += [(make, f"numpy.{core}.multiarray.{make.__name__}") for make in PICKLED for core in ("core", "_core")]
 

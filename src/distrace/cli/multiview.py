@@ -59,13 +59,13 @@ class Multiview:
         views = [view.at_most(self.size).to(run.device) for view in found.views]
         views = [replace(view, mask=None) for view in views] if self.ignore_masks else views
         usual = KNOWN_PLACE if self.fixed else UNKNOWN_PLACE
-        compared = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
-        config = replace(usual, starts=self.starts, seed=self.seed, comparison=compared)
+        comparison = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
+        config = replace(usual, starts=self.starts, seed=self.seed, comparison=comparison)
         steps = _fitted(model, views, config)
         last = steps[-1]
         prior = prior_of(model.codes)
         shape = PlacedShape(prior.coordinates(last.code), last.place)
-        agreed = view_agreements(model.decoder, views, prior, shape, compared)
+        agreed = view_agreements(model.decoder, views, prior, shape, comparison)
         for view in agreed:
             if view.is_outlier:
                 run.warn(_doubt(view))
