@@ -64,7 +64,8 @@ def test_importing_the_package_or_asking_for_help_loads_no_torch(program: str) -
 
 
 def test_public_names_are_attributes_of_the_package_and_render_is_the_function() -> None:
-    assert distrace.__all__ == dir(distrace) == distrace.public.__all__
+    assert distrace.__all__ == distrace.public.__all__
+    assert set(distrace.__all__) == set(dir(distrace))
     assert all(getattr(distrace, name) is getattr(distrace.public, name) for name in distrace.__all__)
     assert callable(distrace.render)
     assert distrace.fields.base.SDF is distrace.SDF
