@@ -1,13 +1,16 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check results release lock clean
+.PHONY: demo test test-slow check results release lock clean
 
 demo: .venv/installed
 	$(BIN)/distrace demo --out out/demo
 
 test: .venv/installed  ## each file in one process: what its tests share is made once
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
+
+test-slow: .venv/installed  ## those that take over ten seconds each
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 check: .venv/installed  ## style and types
 	$(BIN)/ruff check src experiments tests examples
@@ -18,7 +21,7 @@ results: .venv/installed  ## the tables that take under a minute
 	$(BIN)/python -m experiments fields sofas --size 64 --out out/fields
 	$(BIN)/distrace check-gradients sofas --out out/gradient-check
 
-release: .venv/installed check test
+release: .venv/installed check test test-slow
 	$(BIN)/python -m pip install --quiet build twine
 	$(BIN)/python -m build
 	$(BIN)/python -m twine check dist/*

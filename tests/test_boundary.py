@@ -163,6 +163,7 @@ def test_of_a_shaded_sphere_hits_and_outline_together_make_the_derivative() -> N
     assert derivative(mean, 0.5) == pytest.approx(closed, rel=0.05)
 
 
+@pytest.mark.slow
 def test_a_network_moves_its_outline_with_its_code() -> None:
     model = load_model("sofas")
     code, direction = model.codes[0], normalize(model.codes[3] - model.codes[0], dim=0)

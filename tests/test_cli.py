@@ -241,6 +241,7 @@ def test_complete_takes_points_and_says_what_else_would_fit(model: Path, run: Co
     assert "Other shapes that fit" in page
 
 
+@pytest.mark.slow
 def test_train_samples_a_folder_of_meshes_first(run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "mine").mkdir()
     trimesh.creation.box((1, 2, 3)).export(tmp_path / "mine" / "box.ply")

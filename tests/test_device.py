@@ -73,6 +73,7 @@ def test_what_is_rendered_is_on_one_device(words: str, model: Path, command: Com
     assert (tmp_path / "out" / "result.json").exists()
 
 
+@pytest.mark.slow
 def test_what_is_fitted_is_on_the_models_device(
     model: Path, command: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -126,7 +127,7 @@ def test_photographs_are_brought_to_the_model(
     for name, little in (("SHOWN", 1), ("FRAMES", 1), ("SIZE", 24)):
         monkeypatch.setattr(views_page, name, little)
     for name in ("KNOWN_PLACE", "UNKNOWN_PLACE"):
-        short = replace(getattr(multiview, name), iterations=3, trial=1, approach=1, levels=(0.5, 1.0))
+        short = replace(getattr(multiview, name), iterations=3, trial=1, place_iterations=1, levels=(0.5, 1.0))
         monkeypatch.setattr(multiview, name, short)
     command("multiview", model, photographs, *more, "--starts", 2, "--rays", 200, "--resolution", 16)
     assert (tmp_path / "out" / "result.json").exists()

@@ -143,6 +143,7 @@ def test_a_camera_twenty_degrees_off_is_found(kept: tuple[str, ...]) -> None:
     assert percent < 0.5
 
 
+@pytest.mark.slow
 def test_from_the_outline_alone_most_cameras_twenty_degrees_off_are_found() -> None:
     """Of 64 pixels: it tells no more than a degree, and some starts end where another outline is nearly the same."""
     observed = view(dtype=torch.float32)
@@ -151,6 +152,7 @@ def test_from_the_outline_alone_most_cameras_twenty_degrees_off_are_found() -> N
     assert sum(degrees < 1 and percent < 1 for degrees, percent in errors) >= 3
 
 
+@pytest.mark.slow
 def test_from_normals_alone_the_orientation_is_found() -> None:
     observed = view(dtype=torch.float32)
     degrees, _ = pose_error(found(only(observed, "normal"), turned(observed.camera, 10)), observed.camera)

@@ -202,6 +202,7 @@ def test_a_code_is_fitted_to_photographs_alone(decoder: Decoder, views: list[Pho
     assert error(decoder, fitted(decoder, views, CONFIG)) < 0.15 * error(decoder, MEAN)
 
 
+@pytest.mark.slow
 def test_a_code_and_a_placement_are_fitted_together(decoder: Decoder, monkeypatch: pytest.MonkeyPatch) -> None:
     places = []
     starts = Initialiser.starts
@@ -245,6 +246,7 @@ def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) ->
         fit_photos(decoder, views[:1], PRIOR)
 
 
+@pytest.mark.slow
 def test_all_evaluations_are_counted(
     decoder: Decoder, views: list[Photograph], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -158,6 +158,7 @@ def test_a_loss_on_a_decoders_normals_falls_along_its_gradient(decoder: tuple[De
     assert after < 0.97 * loss.item(), "a tenth of it, to first order"
 
 
+@pytest.mark.slow
 def test_shading_a_decoder_keeps_exact_values_and_its_gradient_follows_differences() -> None:
     """Outlines and exact normals alone give a slope of the other sign here."""
     model = load_model("chairs")

@@ -254,6 +254,7 @@ def test_a_decoder_s_field_knows_its_code_and_the_decoder_stays_as_it_was() -> N
     assert all(weight.dtype == torch.float32 and weight.requires_grad for weight in decoder.parameters())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "code"), [("sofas", 3), ("chairs", 200), ("tables", 30), ("planes", 9)])
 def test_the_footprint_normals_of_bundled_decoders_follow_differences_to_a_tenth(name: str, code: int) -> None:
     """Over steps that move hits: single pieces of the network do not matter there."""

@@ -211,6 +211,7 @@ def test_a_camera_between_two_moves_as_they_do() -> None:
     torch.testing.assert_close(interpolated_step(steps[:1], eyes[:1], eyes[2]), steps[0])
 
 
+@pytest.mark.slow
 def test_a_disturbed_camera_is_registered(views: list[Photograph], fitted: Reconstruction) -> None:
     off = moved(views[0], rigid_motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
     found = registered(fitted, off, SHORT)

@@ -53,6 +53,7 @@ def spheres_split(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]
     return folder / "balls.csv", folder
 
 
+@pytest.mark.slow
 def test_procedural_shapes_are_sampled_and_learnt_with_the_class(
     run: Command, run_distrace: Command, tmp_path: Path
 ) -> None:
@@ -137,6 +138,7 @@ def test_focal_also_looks_at_what_was_fitted_through_other_focal_lengths(
     assert all(0 < row["iou_median"] <= 1 and row["depth_error_median"] < 0.5 for row in facts["tests"])
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("small_trials")
 def test_spread_correlates_spread_and_error(
     model: Path, spheres_split: tuple[Path, Path], run: Command, tmp_path: Path
@@ -172,6 +174,7 @@ def test_splits_and_card_describe_what_a_model_was_trained_on(
     assert "| held | held out | me | CC0-1.0 |" in said
 
 
+@pytest.mark.slow
 def test_choices_trains_small_networks(
     spheres_split: tuple[Path, Path],
     run: Command,

@@ -28,6 +28,7 @@ def test_a_row_for_every_size_strategy_network_and_number_of_views() -> None:
     assert "3 × 16" in growth_page(rows)
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from Linux")
 def test_memory_is_what_the_images_take_and_little_more() -> None:
     small, large = growth.peak_memory("sofas", 0, 64), growth.peak_memory("sofas", 0, 256)

@@ -96,6 +96,7 @@ def test_a_density_says_how_many_depths_are_left(place: Place) -> None:
     assert view.mask.sum() == counts["dense"]
 
 
+@pytest.mark.slow
 def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
     wanted = trial(place, density="20")
     first = done(place, wanted)
@@ -109,6 +110,7 @@ def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
     assert again.chamfer == pytest.approx(first.chamfer, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_shapes_are_completed_and_looked_at_on_the_device(
     place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

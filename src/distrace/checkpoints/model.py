@@ -21,6 +21,7 @@ from torch import Tensor
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
 from distrace.equality import ByValue, summary
 from distrace.errors import explained
+from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.files import written
@@ -47,7 +48,7 @@ class Model(ByValue):
     @overload
     def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]: ...
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]:
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField[ShapeField]:
         """Returns the signed distance field of a training code, of any code, or of B shapes from codes [B, length].
 
         Raises `ValueError` for a number or a length that the model has not.
