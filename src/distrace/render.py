@@ -25,7 +25,7 @@ from distrace.tracing.sphere_tracing import MARCHES, Outcome, Trace, TraceConfig
 from distrace.tracing.tracer import TracerConfig, trace_images
 
 FOOTPRINT = 10.0  # pixels: with narrower ones the derivatives of a ReLU network's normals are off by more than 10 %
-WIDEST = 1 / 20  # of the radius: what coarse pixels cover is no longer one piece of surface
+WIDEST = 1 / 24  # of the radius: what coarse pixels cover is no longer one piece of surface
 
 CLEARANCE_REACH = 0.02  # of the radius: the first step of the search for a ray's least value
 DOUBTFUL_SHARE = 1e-3  # of the rays: more without an answer are worth a warning
