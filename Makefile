@@ -9,7 +9,7 @@ demo: .venv/installed
 test: .venv/installed  ## each file in one process: what its tests share is made once
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
-test-slow: .venv/installed  ## those that take over ten seconds each
+test-slow: .venv/installed  ## those that take seven seconds or more
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 check: .venv/installed  ## style and types

@@ -115,6 +115,7 @@ def photographs(model: Path, tmp_path: Path) -> Path:
     return tmp_path / "views"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("more", [(), ("--changing-light", "--fixed")])
 def test_photographs_are_brought_to_the_model(
     more: tuple[str, ...],

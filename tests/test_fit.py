@@ -52,6 +52,7 @@ def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> Non
     assert step.evaluations > 0
 
 
+@pytest.mark.slow
 def test_two_views_recover_it_too_and_normals_help() -> None:
     other = Camera.orbit(120, -10, 2.5, height=40, width=40, focal_px=40.0)
     views = [view_of(TRUE, normal=True).sparse(30), view_of(TRUE, other, normal=True).sparse(30)]
@@ -79,6 +80,7 @@ def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     torch.testing.assert_close(fitted.code, TRUE, atol=0.01, rtol=0)
 
 
+@pytest.mark.slow
 def test_from_where_nothing_is_hit_the_clearance_leads_back() -> None:
     aside = torch.tensor([0.15, -0.45, -0.3, 0.3])
     prior = Prior(aside, torch.diag(torch.tensor([0.1, 0.3, 0.3, 0.3])))

@@ -8,13 +8,14 @@ from torch import Tensor, nn
 
 from distrace.camera import Camera
 from distrace.checking.differences import derivatives, differences
-from distrace.checking.footprints import Footprints
+from distrace.checking.footprints import STEP_OF_VIEW, Footprints
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, check_gradients, compare
 from distrace.checking.moves import all_moves, decoder_changes, in_double, own_changes
 from distrace.checking.retrace import DOUBLE, SINGLE, Retraced, minimum_near, root_near
 from distrace.checkpoints.model import load_model
 from distrace.fields import primitives
 from distrace.fields.decoder import Decoder, NetworkSpecs
+from distrace.render import WIDEST
 
 CAMERA = Camera.orbit(30, 20, 4.97, height=16, width=16)
 VIEW = Camera.orbit(30, 20, 4.97, height=48, width=48, dtype=torch.float64)
@@ -222,7 +223,7 @@ def test_zero_against_zero_is_no_agreement() -> None:
         assert rows["normal", parameter].verdict == "zero"
         assert not rows["normal", parameter].agrees
         assert rows[FOOTPRINT, parameter].verdict != "zero"
-        assert rows[FOOTPRINT, parameter].step == pytest.approx(1 / 400)
+        assert rows[FOOTPRINT, parameter].step == pytest.approx(WIDEST * STEP_OF_VIEW)
     assert rows["normal", "placement"].verdict == "agrees", "normals turn with the object"
     counts = found.verdicts()
     assert counts["zero"] == sum(row.verdict == "zero" for row in found.rows) == 4

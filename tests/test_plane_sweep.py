@@ -87,6 +87,7 @@ def test_the_depth_loss_is_higher_where_a_hollow_is_filled_or_a_part_is_missing(
     assert depth_loss(BOWL(points) + 0.1) > 3 * true
 
 
+@pytest.mark.slow
 def test_initialisation_finds_a_hollow_that_no_outline_shows(bowl: list[Photograph], depths: ConsistentDepths) -> None:
     specs = SurfaceSpecs(width=32, layers=2, frequencies=3, features=4)
     hollow = torch.tensor([[0.0, 0.0, 0.5]])

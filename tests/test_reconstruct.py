@@ -397,6 +397,7 @@ def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
             parted(views, every)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_hull")
 def test_the_command_writes_a_mesh_in_the_folders_world(
     views: list[Photograph], tmp_path: Path, run: Command, monkeypatch: pytest.MonkeyPatch
