@@ -38,7 +38,9 @@ def __getattr__(name: str) -> Any:
         if name != "render" and find_spec(f"distrace.{name}"):
             return import_module(f"distrace.{name}")
         if name in __dir__():
-            return getattr(import_module("distrace.public"), name)
+            value = getattr(import_module("distrace.public"), name)
+            globals()[name] = value  # later uses find it without a search for a module of that name
+            return value
     raise AttributeError(f"module 'distrace' has no attribute {name!r}")
 
 
