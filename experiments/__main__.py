@@ -6,6 +6,7 @@ from experiments.commands.costs import Fields, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
 from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
+from experiments.commands.placement import Placement
 from experiments.commands.procedural import Procedural
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
 from experiments.commands.training_data import Card, Choices, Splits
@@ -25,6 +26,7 @@ COMMANDS = {
     "focal": Focal,
     "spread": Spread,
     "pose": Pose,
+    "placement": Placement,
     "multiview": Multiview,
     "photographs": Photographs,
     "foreign-models": ForeignModels,

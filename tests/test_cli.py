@@ -75,6 +75,9 @@ def result(out: Path, *keys: str) -> dict:
     return content
 
 
+COMPLETED = {"result.json", "mesh.ply", "mesh.glb", "placement.json", "code.npy", "report.html", "shaded.png"}
+
+
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
@@ -209,7 +212,7 @@ def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path
     options = ("--points", 50, "--solver", "adam", "--iterations", 30, "--starts", 2, "--resolution", 16)
     run("complete", model, observation, "--reference", tmp_path / "true.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
-    assert names(out) == {"result.json", "mesh.ply", "code.npy", "report.html", "shaded.png"}
+    assert names(out) == COMPLETED
     facts = result(out, "evaluations", "setup_evaluations", "loss", "chamfer_to", "chamfer_from", "chamfer")
     assert facts["evaluations"] > 1000
     assert facts["chamfer"] == pytest.approx(facts["chamfer_to"] + facts["chamfer_from"])
@@ -222,15 +225,53 @@ def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path
     assert "<html" in (out / "report.html").read_text(encoding="utf-8")[:500]
 
 
+def test_complete_finds_where_the_shape_is(model: Path, run: Command, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=1.2)
+    ball.apply_translation((5.0, -3.0, 9.0))
+    ball.export(tmp_path / "true.ply")
+    ball.update_faces(ball.triangles_center[:, 2] > 8.8)
+    ball.remove_unreferenced_vertices()
+    ball.export(tmp_path / "part.ply")
+    options = ("--reference", tmp_path / "true.ply", "--resolution", 24, "--up", "z", "--strict")
+    run("complete", model, tmp_path / "part.ply", *options, "--out", tmp_path / "out")
+    out = tmp_path / "out"
+    assert names(out) == COMPLETED
+    facts = result(
+        out, "evaluations", "verdict", "explained", "free_space_violated", "disagreement", "reason", "chamfer"
+    )
+    assert facts["verdict"] == "trusted"
+    matrix = np.array(json.loads((out / "placement.json").read_text())["T_input_object"])
+    assert np.abs(matrix[:3, 3] - (5.0, -3.0, 9.0)).max() < 0.15
+    for name in ("mesh.ply", "mesh.glb"):
+        vertices = trimesh.load(out / name, process=False, force="mesh").vertices
+        assert np.linalg.norm(vertices - (5.0, -3.0, 9.0), axis=1).mean() == pytest.approx(1.2, abs=0.06)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert 'class="banner trusted"' in page
+
+
+def test_a_completion_that_fails_says_so_and_strict_tells_the_shell(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    trimesh.PointCloud(np.random.default_rng(0).uniform(0, 30, (2000, 3))).export(tmp_path / "fog.ply")
+    options = ("--resolution", 16, "--out", tmp_path / "out")
+    run("complete", model, tmp_path / "fog.ply", *options)
+    assert result(tmp_path / "out", "verdict")["verdict"] == "failed"
+    assert "failed: " in capsys.readouterr().out
+    with pytest.raises(SystemExit) as stopped:
+        run("complete", model, tmp_path / "fog.ply", "--strict", *options)
+    assert stopped.value.code == 3
+
+
 def test_complete_takes_points_and_says_what_else_would_fit(model: Path, run: Command, tmp_path: Path) -> None:
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
     ball.update_faces(ball.triangles_center[:, 2] > 0)
     ball.remove_unreferenced_vertices()
     ball.export(tmp_path / "half.ply")
-    run("complete", model, tmp_path / "half.ply", "--plausible", 2, "--resolution", 16, "--out", tmp_path / "out")
+    options = ("--frame", "canonical", "--plausible", 2, "--resolution", 16)
+    run("complete", model, tmp_path / "half.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
     others = {"plausible-1.ply", "plausible-2.ply"}
-    assert names(out) == {"result.json", "mesh.ply", "code.npy", "report.html", "shaded.png", *others}
+    assert names(out) == COMPLETED | others
     mesh = trimesh.load(out / "mesh.ply", process=False)
     assert np.abs(np.linalg.norm(mesh.vertices, axis=1) - 0.6).mean() < 0.05
     spread = mesh.metadata["_ply_raw"]["vertex"]["data"]["spread"]

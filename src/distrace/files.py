@@ -3,7 +3,7 @@
 import glob
 import json
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -55,9 +55,10 @@ def save_json(path: str | Path, content: Any) -> None:
     save_text(path, json.dumps(content, indent=1, default=float) + "\n")
 
 
-def save_arrays(path: str | Path, arrays: dict[str, Tensor]) -> None:
-    """Writes tensors as `.npz`."""
+def save_arrays(path: str | Path, arrays: Mapping[str, Tensor], words: Mapping[str, str] = {}) -> None:
+    """Writes tensors, and single words, as `.npz`."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
+    content |= {name: np.array(word) for name, word in words.items()}
     with written(path) as file:
         np.savez_compressed(file, **content)
 

@@ -9,6 +9,7 @@ EXTRAS = {
     "av": "movie",
     "matplotlib": "report",
     "plotly": "report",
+    "OpenEXR": "scans",
 }
 
 

@@ -98,8 +98,9 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
 
 
 def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
+    """Writes a mesh in the format of the name: PLY or GLB."""
     with written(path) as file:
-        mesh.export(file, file_type="ply")
+        mesh.export(file, file_type=path.suffix.removeprefix("."))
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:

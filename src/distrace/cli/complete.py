@@ -1,5 +1,6 @@
-"""`complete` and `demo`: a whole shape from one depth view, or from points."""
+"""`complete` and `demo`: a whole shape from depths or points."""
 
+import sys
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -8,15 +9,18 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from distrace.cli.common import ModelName, default, opened
+from distrace.cli.common import Flag, ModelName, default, opened
 from distrace.cli.completion import Task, complete
-from distrace.cli.console import console, start
+from distrace.cli.console import Run, console, start
+from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
-from distrace.data.observation import View, load_view
+from distrace.data.observation import View, is_canonical, load_view
+from distrace.data.scan import CLOUDS, ScanOptions, load_scan
 from distrace.data.solid import load_geometry
 from distrace.errors import explained
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
+from distrace.fitting.judge import Verdict
 from distrace.mesh import MeshConfig
 
 if TYPE_CHECKING:
@@ -24,45 +28,78 @@ if TYPE_CHECKING:
 
 OBSERVATIONS = files("distrace") / "observations"
 DEMO_POINTS = 100
+FAILED = 3  # exit status of `--strict`
+
+
+Axis = Literal["x", "y", "z", "-x", "-y", "-z", "unknown"]
 
 
 @dataclass(frozen=True)
 class Complete:
-    """Complete a shape from one depth view or a point cloud.
+    """Complete a shape from a depth image, an observation or a point cloud, wherever the object is.
 
-    Writes the mesh, the code, and a page that compares them with the observation.
+    Writes the mesh, the placement, the code, a verdict, and a page that shows them beside the input.
     """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
-    observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]  # or POINTS.ply
+    inputs: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]]
+    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world"""
     out: Path = Path("out/complete")
+    up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
+    """axis of the input's frame that points up, or `unknown`"""
+    intrinsics: Annotated[str | None, default("none", "K")] = None
+    """of a depth image: fx,fy,cx,cy in pixels, or a file with a 3 × 3 matrix"""
+    mask: Annotated[Path | None, default("none", "PNG")] = None  # white where the object is
+    box: Annotated[tuple[int, int, int, int] | None, default("none", "LEFT TOP RIGHT BOTTOM")] = None
+    """rectangle around the object, in pixels; the floor and separate things in it are left out"""
+    frame: Annotated[Literal["input", "canonical"] | None, default("canonical where an input says so", "FRAME")] = None
+    """canonical: the object lies in the unit sphere, upright, turned as its class is"""
     reference: Annotated[Path | None, default("none", "PLY")] = None
-    """true surface to measure against: a mesh or points (PLY)"""
+    """true surface in the input's frame, to measure against: a mesh or points"""
+    strict: Flag = False  # exit status 3 where the verdict is `failed`
     points: Annotated[int | None, default("all", "INT")] = None  # number of depths or points to use, drawn at random
-    ignore: tuple[Literal["mask", "normal"], ...] = ()  # parts to ignore; only adam uses a view's normals
-    solver: Literal["lm", "adam"] = "lm"  # Levenberg–Marquardt, or Adam as in DIST; clouds need lm
-    iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None
-    starts: int = FitConfig.starts  # of the multi-start fit
-    plausible: int = 0  # number of other completions that also fit
     seed: int = 0
     resolution: int = 128  # cells along each side of the mesh's grid; 256 keeps parts thinner than 1/64 whole
     device: str = "cpu"
+    ignore: tuple[Literal["mask", "normal"], ...] = ()  # canonical: parts to ignore; only adam uses a view's normals
+    solver: Literal["lm", "adam"] = "lm"  # canonical: Levenberg–Marquardt, or Adam as in DIST; clouds need lm
+    iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None  # canonical
+    starts: int = FitConfig.starts  # canonical: of the multi-start fit
+    plausible: int = 0  # canonical: number of other completions that also fit
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        cloud = self.observation.suffix.lower() == ".ply"
-        chosen = CodeFitConfig if self.solver == "lm" or cloud else FitConfig
-        iterations = chosen.iterations if self.iterations is None else self.iterations
-        fit = chosen(iterations=iterations, starts=self.starts, seed=self.seed)
-        mesh = MeshConfig(self.resolution, device=run.device)
         if self.plausible < 0 or (self.points is not None and self.points < 1):
             given = f"--plausible {self.plausible} and --points {self.points}"
             raise ValueError(f"{given} were given; one cannot be negative, and at least one point is needed")
-        full = load_cloud(self.observation) if cloud else load_view(self.observation)
+        if not self.inputs:
+            raise ValueError("no input was given; give a depth image, an observation or a cloud of points")
+        mesh = MeshConfig(self.resolution, device=run.device)
+        frame = self.frame or ("canonical" if all(map(is_canonical, self.inputs)) else "input")
+        with run.noticing():
+            verdict = self._canonical(run, mesh) if frame == "canonical" else self._placed(run, mesh)
+        if self.strict and verdict.name == "failed":
+            sys.exit(FAILED)
+
+    def _placed(self, run: Run, mesh: MeshConfig) -> Verdict:
+        scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box))
+        scan = scan if self.points is None else scan.sparse(self.points, self.seed)
+        truth = None if self.reference is None else _reference(self.reference)
+        return complete_scan(run, ScanTask(opened(self.model, run.device), scan, truth, mesh, self.seed))
+
+    def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
+        if len(self.inputs) > 1:
+            raise ValueError(f"{len(self.inputs)} inputs were given; one is completed in the canonical frame")
+        path = next(iter(self.inputs))
+        cloud = path.suffix.lower() in CLOUDS
+        chosen = CodeFitConfig if self.solver == "lm" or cloud else FitConfig
+        iterations = chosen.iterations if self.iterations is None else self.iterations
+        fit = chosen(iterations=iterations, starts=self.starts, seed=self.seed)
+        full = load_cloud(path) if cloud else load_view(path)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
         self._check(known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
-        complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
+        return complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
 
     def _check(self, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
         """Raises `ValueError` where nothing that the solver uses is left."""
@@ -70,7 +107,9 @@ class Complete:
             used = known if chosen is FitConfig else known.without("normal")
             if not used.observed.any():
                 left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
-                raise ValueError(f"{self.observation}{left} has no depth and no mask of the object to complete it from")
+                raise ValueError(
+                    f"{next(iter(self.inputs))}{left} has no depth and no mask of the object to complete it from"
+                )
 
 
 @dataclass(frozen=True)

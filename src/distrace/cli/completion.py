@@ -1,4 +1,4 @@
-"""A completion as a command runs it: the fit, the mesh, the distance to the truth, and the page."""
+"""A completion in the canonical frame: the fit, the mesh, the distance to the truth, the verdict, and the page."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,15 +15,18 @@ from distrace.cli.common import save_mesh
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
-from distrace.files import save_text, written
+from distrace.data.scan import canonical_scan
+from distrace.files import save_json, save_text, written
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.free_space import LEFT_OUT, completed
+from distrace.fitting.judge import Verdict, judged
 from distrace.fitting.methods import completing
 from distrace.fitting.multistart import Step
 from distrace.fitting.posterior import plausible, spread
 from distrace.mesh import MeshConfig
-from distrace.metrics import Chamfer, chamfer
+from distrace.metrics import Chamfer, chamfer, iou
+from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.render import render
 from distrace.report import completion_page as report
@@ -74,14 +77,16 @@ class Outcome:
         return sum(step.evaluations for step in (*self.steps, *self.others))
 
 
-def complete(run: Run, task: Task) -> None:
-    """Fits, and writes mesh, code, pictures, page and `result.json`."""
+def complete(run: Run, task: Task) -> Verdict:
+    """Fits, and writes mesh, placement, code, pictures, page and `result.json`."""
     steps = _fitted(task)
     last = steps[-1]
     with written(run.out / "code.npy") as file:
         np.save(file, last.code.cpu().numpy())
     outcome = _outcome(task, steps)
     save_mesh(run.out / "mesh.ply", outcome.mesh)
+    save_mesh(run.out / "mesh.glb", outcome.mesh)
+    save_json(run.out / "placement.json", {"T_input_object": Similarity.identity().T_world_object.tolist()})
     for step in outcome.others:
         save_mesh(run.out / f"plausible-{step.start + 1}.ply", task.surface(step))
     content = _page_content(task, outcome)
@@ -89,12 +94,14 @@ def complete(run: Run, task: Task) -> None:
     with run.optional("report.html"):
         save_text(run.out / "report.html", report.completion_page(content))
     facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
-    lines = []
+    facts |= content.verdict.facts()
+    lines = [f"{content.verdict.name}: {content.verdict.reason}"]
     if outcome.chamfer:
         distances = outcome.chamfer
-        lines = [f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"]
+        lines += [f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"]
         facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
     run.finish(facts, *lines)
+    return content.verdict
 
 
 def _fitted(task: Task) -> list[Step]:
@@ -151,7 +158,12 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
         "seed": str(task.fit.seed),
     }
+    sdf = task.model.field(last.code)
+    overlap = None if known.mask is None else iou(torch.from_numpy(after.mask), known.mask)
+    scan = canonical_scan(task.known).to(task.mesh.device)
+    verdict = judged(scan, sdf, Similarity.identity().to(task.mesh.device), silhouette=overlap)
     return report.Completion(
+        verdict=verdict,
         title=f"A shape completed from {'points' if isinstance(task.known, Cloud) else 'one depth view'}",
         observed_depth=known.depth.numpy(),
         observed_mask=None if known.mask is None else known.mask.numpy(),

@@ -13,6 +13,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.checks import ALMOST
 from distrace.data.observation import View
+from distrace.data.pcd import load_pcd
 from distrace.data.solid import load_geometry
 from distrace.errors import DoubtfulResult, about, explained
 
@@ -77,6 +78,26 @@ def load_cloud(path: Path) -> Cloud:
                 " around the origin: centre it and divide by its largest radius"
             )
     return Cloud(points, normals)
+
+
+def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
+    """Returns the finite points of a cloud in any frame and unit: PLY, PCD, XYZ, or the vertices of a mesh.
+
+    A `DoubtfulResult` says how many were dropped. Raises `ValueError` for a file without any.
+    """
+    with explained(f"{path} cannot be read as a cloud of points; give a PLY, PCD or XYZ file", path):
+        if path.suffix.lower() == ".pcd":
+            columns = load_pcd(path)
+            points = np.stack([columns[axis] for axis in "xyz"], axis=1)
+        else:
+            loaded = load_geometry(path)
+            points = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
+    usable = np.isfinite(points).all(1)
+    if not usable.any():
+        raise ValueError(f"{path}: it has {len(points)} points, and none that is finite")
+    if not usable.all():
+        _warn(f"{path}: {(~usable).sum()} points that are not finite were dropped")
+    return points[usable]
 
 
 def _warn(sentence: str) -> None:

@@ -3,7 +3,9 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -15,6 +17,8 @@ from distrace.data.solid import Solid
 from distrace.errors import about
 from distrace.files import save_arrays
 from distrace.shading import Picture, shaded_picture
+
+CANONICAL = "canonical"
 
 
 @dataclass(frozen=True)
@@ -86,6 +90,21 @@ def load_view(path: Path) -> View:
 
 def read_view(path: Path) -> View:
     """The same wherever the camera is. What lies outside of the mask is left out: it is not the object's."""
+    scene, mask = read_scene(path)
+    with about(path):
+        view = scene if mask is None else replace(scene, mask=mask).masked(mask)
+        if not view.observed.any():
+            raise ValueError("it shows nothing: no depth is finite and positive, and no pixel is marked as object")
+        if view.normal is not None:
+            check_normals(view.camera, view.normal)
+    return view
+
+
+def read_scene(path: Path) -> tuple[View, Bool[Tensor, "height width"] | None]:
+    """Reads a view with all its depths, also those of other things than the object; and the object's mask, if known.
+
+    Raises `ValueError`, in one sentence, for what is missing or makes no sense.
+    """
     arrays = read_arrays(path)
     with about(path):
         depth = depth_image(arrays["depth"])
@@ -93,21 +112,26 @@ def read_view(path: Path) -> View:
         camera = camera_of(arrays["intrinsics"], arrays["T_world_camera"], *size)
         mask = mask_image(arrays["mask"], *size) if "mask" in arrays else None
         normal = normal_image(arrays["normal"], *size) if "normal" in arrays else None
-        view = View(camera, depth, mask, normal)
+        scene = View(camera, depth, None, normal)
         if mask is not None:
-            check_mask(mask, view.seen)
-            view = view.masked(mask)
-        if not view.observed.any():
-            raise ValueError("it shows nothing: no depth is finite and positive, and no pixel is marked as object")
-        if view.normal is not None:
-            check_normals(camera, view.normal)
-    return view
+            check_mask(mask, scene.seen)
+    return scene, mask
+
+
+def is_canonical(path: Path) -> bool:
+    """Returns whether a file says that its object lies as the model's shapes do: an `.npz` with `frame` "canonical"."""
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            return "frame" in arrays.files and str(arrays["frame"]) == CANONICAL
+    except (OSError, EOFError, ValueError, AttributeError, TypeError, BadZipFile):
+        return False  # whoever reads it says what is wrong
 
 
 def save_view(path: Path, view: View) -> None:
+    """Writes a view of a shape in the unit sphere as `OBSERVATION.npz`."""
     arrays = {"depth": view.depth, "intrinsics": view.camera.intrinsics, "T_world_camera": view.camera.T_world_camera}
     arrays |= {name: image for name, image in (("mask", view.mask), ("normal", view.normal)) if image is not None}
-    save_arrays(path, arrays)
+    save_arrays(path, arrays, {"frame": CANONICAL})
 
 
 def observe(solid: Solid, camera: Camera) -> View:

@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from distrace import shading
+from distrace.fitting.judge import Verdict
 from distrace.metrics import POINTS, Chamfer, iou
 from distrace.render import Buffers
 from distrace.report.charts import curves
 from distrace.report.page import Html, figure, key, page, paragraph, ramp, row, section, table
+from distrace.report.scan_page import verdict_banner
 from distrace.report.scene import scene
 from distrace.shading import Picture
 
@@ -42,6 +44,7 @@ class View:
 class Completion:
     """The content of the page of a shape that was fitted to one depth view; what is unknown is None."""
 
+    verdict: Verdict
     title: str
     observed_depth: Float[np.ndarray, "height width"]  # inf where there is none
     observed_mask: Bool[np.ndarray, "height width"] | None
@@ -63,6 +66,7 @@ def completion_page(completion: Completion) -> str:
     count = f"{len(completion.points_world):,}"
     lead = f"A whole surface from {count} points: what was observed, the fitted shape and its errors."
     sections = [
+        verdict_banner(completion.verdict),
         _observed(completion),
         _shapes(completion),
         _space(completion),

@@ -51,6 +51,10 @@ th { font-weight: 600; color: var(--soft); font-size: .85rem; white-space: nowra
 .chart { max-width: 820px; margin: 18px 0; }
 .chart svg { display: block; width: 100%; height: auto; }
 .chart text { font-family: inherit !important; }
+.banner { margin-top: 28px; padding: 14px 18px; border-radius: 10px; border: 1px solid; font-weight: 600; }
+.banner.trusted { color: #1b5e36; background: #e5f4ea; border-color: #9fd0b1; }
+.banner.doubtful { color: #6b4a00; background: #fff4d6; border-color: #e6c564; }
+.banner.failed { color: #8a1c1c; background: #fde7e7; border-color: #e7a3a3; }
 .scene { height: min(600px, 85vw, 80vh); margin: 18px 0; border: 1px solid var(--line); border-radius: 10px;
   background: var(--card); overflow: hidden; }
 """
@@ -100,6 +104,11 @@ def page(title: str, lead: str, sections: Sequence[Html]) -> str:
 
 def section(heading: str, *blocks: Html) -> Html:
     return Html(f"<section><h2>{escape(heading)}</h2>\n" + "\n".join(blocks) + "</section>")
+
+
+def banner(kind: str, text: str) -> Html:
+    """Returns a line that nobody overlooks; `kind` is `trusted`, `doubtful` or `failed`."""
+    return Html(f'<div class="banner {kind}" role="status">{escape(text)}</div>')
 
 
 def paragraph(text: str) -> Html:

@@ -1,0 +1,135 @@
+"""A completion in the frame of its input: the fit of code and placement, the mesh, the verdict, and the page."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from distrace import shading
+from distrace.camera import Camera
+from distrace.checkpoints.model import Model
+from distrace.cli.common import save_mesh
+from distrace.cli.console import Run, console, progress
+from distrace.data.scan import Scan
+from distrace.files import save_json, save_text, written
+from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
+from distrace.fitting.judge import Verdict
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.metrics import chamfer
+from distrace.pose import Similarity
+from distrace.prior import prior_of
+from distrace.render import Buffers, render
+from distrace.report import scan_page as report
+
+if TYPE_CHECKING:
+    import trimesh
+
+PICTURE = 192  # pixels along the longer side, of what the sensor sees
+SIDE = 128  # pixels, of the other views
+VIEWS = {
+    "front": (0, 15),
+    "left": (90, 15),
+    "back": (180, 15),
+    "above": (30, 60),
+}  # azimuth and elevation, of the object
+
+
+@dataclass(frozen=True)
+class ScanTask:
+    """A scan to complete, and the settings."""
+
+    model: Model
+    scan: Scan
+    truth: "trimesh.Trimesh | np.ndarray | None"  # in the scan's frame
+    mesh: MeshConfig
+    seed: int
+
+
+def complete_scan(run: Run, task: ScanTask) -> Verdict:
+    """Fits, and writes code, placement, meshes, pictures, page and `result.json`."""
+    fit = _fitted(task)
+    with written(run.out / "code.npy") as file:
+        np.save(file, fit.code.cpu().numpy())
+    place = fit.place.to("cpu")
+    save_json(run.out / "placement.json", {"T_input_object": place.T_world_object.tolist()})
+    mesh = extract_mesh(task.model.field(fit.code), task.mesh)
+    mesh.apply_transform(place.T_world_object.double().numpy())
+    save_mesh(run.out / "mesh.ply", mesh)
+    save_mesh(run.out / "mesh.glb", mesh)
+    pictures = _pictures(task, fit, place)
+    shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
+    facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}
+    lines = [f"{fit.verdict.name}: {fit.verdict.reason}"]
+    if task.truth is not None:
+        distances = chamfer(_in_object(mesh, place), _in_object(task.truth, place))
+        lines.append(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
+        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+    with run.optional("report.html"):
+        content = report.ScanCompletion(
+            verdict=fit.verdict,
+            observed=[shading.depth_picture(view.depth) for view in task.scan.views],
+            pictures=pictures,
+            mesh=mesh,
+            points=task.scan.points.cpu().numpy(),
+            losses=fit.losses,
+            place=place,
+            facts=_facts(task, fit),
+        )
+        save_text(run.out / "report.html", report.scan_page(content))
+    run.finish(facts, *lines)
+    return fit.verdict
+
+
+def _fitted(task: ScanTask) -> ScanFit:
+    config = ScanFitConfig(seed=task.seed)
+    prior = prior_of(task.model.codes)
+    scan = task.scan.to(task.mesh.device)
+    console.print(f"fitting {len(scan.points):,} points and {len(scan.free_until):,} rays of free space")
+    fit: ScanFit | None = None
+    with progress("fitting", config.total) as bar:
+        for step in fit_scan(task.model.decoder, scan, prior, config):
+            if isinstance(step, ScanFit):
+                fit = step
+            else:
+                bar.advance(to=step)
+    assert fit is not None
+    return fit
+
+
+@torch.no_grad()
+def _pictures(task: ScanTask, fit: ScanFit, place: Similarity) -> dict[str, shading.Picture]:
+    """Returns the completion from the sensor, and from all sides."""
+    sdf = task.model.field(fit.code)
+    cameras: dict[str, Camera] = {}
+    for number, view in enumerate(task.scan.views):
+        name = "the sensor" if len(task.scan.views) == 1 else f"sensor {number + 1}"
+        cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, PICTURE / max(view.depth.shape))))
+    for name, (azimuth, elevation) in VIEWS.items():
+        cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
+    return {name: _clay(render(sdf, camera.to(task.mesh.device))) for name, camera in cameras.items()}
+
+
+def _clay(buffers: Buffers) -> shading.Picture:
+    return shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
+
+
+def _in_object(shape: "trimesh.Trimesh | np.ndarray", place: Similarity) -> "trimesh.Trimesh | np.ndarray":
+    """Returns a shape of the scan's frame in the unit sphere, where distances are measured."""
+    inverse = np.linalg.inv(place.T_world_object.double().numpy())
+    if isinstance(shape, np.ndarray):
+        return shape @ inverse[:3, :3].T + inverse[:3, 3]
+    return shape.copy().apply_transform(inverse)
+
+
+def _facts(task: ScanTask, fit: ScanFit) -> dict[str, str]:
+    scan = task.scan
+    return {
+        "points": f"{len(scan.points):,}",
+        "rays of free space": f"{len(scan.free_until):,}",
+        "noise of the points": f"{scan.noise:.2g}, in the input's unit",
+        "diameter of the unit sphere": f"{2 * float(fit.place.scale):.4g}, in the input's unit",
+        "evaluations of the network": f"{fit.evaluations:,}",
+        "time of the fit": f"{fit.seconds:.0f} s on {task.mesh.device}",
+        "seed": str(task.seed),
+    }

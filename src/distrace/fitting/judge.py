@@ -1,0 +1,127 @@
+"""The verdict on a completion: how much of the scan it explains, what it contradicts, and whether other fits agree."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.data.scan import Scan
+from distrace.fields.base import SDF
+from distrace.pose import Similarity
+from distrace.rays import meet_sphere
+
+NEAR = 0.03  # of the size: a point that near to the surface is explained by it
+BLOCKED = 0.03  # of the size: a ray that passes that deep through the shape contradicts it
+RAY_SAMPLES = 24
+MOST_RAYS = 600
+MOST_NOISE = 0.02  # of the size, that excuses a distance
+LEAST_REACH = (0.4, 0.2)  # radius of the scan in sizes, least of what is trusted, and of what has not failed
+TRUSTED = (0.85, 0.05, 0.08)  # least explained, most blocked, most disagreement
+FAILED = (0.7, 0.2)  # least explained, most blocked
+SILHOUETTE = (0.85, 0.6)  # least intersection over union of what is trusted, and of what has not failed
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`trusted`, `doubtful` or `failed`, the numbers behind it, and a sentence that says why."""
+
+    name: str
+    explained: float  # share of the scan's points that lie near the surface
+    blocked: float  # share of the rays of free space, of those near the object, that pass through the shape
+    disagreement: float  # how far the other good ends lie from the surface, in sizes; 0 where there are none
+    silhouette: float | None  # intersection over union with the mask, where that is the object's alone
+    reason: str
+
+    def facts(self) -> dict[str, float | str | None]:
+        return {
+            "verdict": self.name,
+            "explained": round(self.explained, 4),
+            "free_space_violated": round(self.blocked, 4),
+            "disagreement": round(self.disagreement, 4),
+            "silhouette_iou": self.silhouette if self.silhouette is None else round(self.silhouette, 4),
+            "reason": self.reason,
+        }
+
+
+@torch.no_grad()
+def judged(
+    scan: Scan, sdf: SDF, place: Similarity, disagreement: float = 0.0, silhouette: float | None = None
+) -> Verdict:
+    """Returns the verdict on a placed shape. `disagreement` is that of the other ends: `disagreement_of`."""
+    near = distances(scan.points, sdf, place, scan.noise) < NEAR
+    explained = float(near.float().mean()) if len(near) else 1.0
+    blocked = _blocked_share(scan, sdf, place)
+    reasons = []
+    if explained < TRUSTED[0]:
+        reasons.append(f"{1 - explained:.0%} of the points lie away from the surface")
+    if blocked > TRUSTED[1]:
+        reasons.append(f"the shape blocks {blocked:.0%} of the rays that saw through it")
+    if disagreement > TRUSTED[2]:
+        reasons.append(f"another fit that is as good lies {disagreement:.0%} of the size away")
+    reach = scan.radius / float(place.scale) if len(near) else 1.0
+    if reach < LEAST_REACH[0]:
+        reasons.append(f"the points reach over {reach:.0%} of the shape")
+    overlap = 1.0 if silhouette is None else silhouette
+    if overlap < SILHOUETTE[0]:
+        reasons.append(f"its silhouette and the mask have an intersection over union of {overlap:.0%}")
+    failed = explained < FAILED[0] or blocked > FAILED[1] or reach < LEAST_REACH[1] or overlap < SILHOUETTE[1]
+    name = "failed" if failed else "doubtful" if reasons else "trusted"
+    usual = (
+        f"{explained:.0%} of the points lie on the surface, and it blocks {blocked:.0%} of the rays that saw through"
+    )
+    return Verdict(name, explained, blocked, disagreement, silhouette, "; ".join(reasons) or usual)
+
+
+def distances(points: Float[Tensor, "n 3"], sdf: SDF, place: Similarity, noise: float = 0.0) -> Float[Tensor, "n"]:
+    """How far points of the scan's frame are from the surface, in sizes, beyond twice the noise."""
+    points = place.to_object(points)
+    length = points.norm(dim=-1).clamp_min(1.0)
+    values = sdf(points / length[:, None]) + length - 1
+    excused = 2 * min(noise / float(place.scale), MOST_NOISE)
+    return (values.abs() - excused).clamp_min(0)
+
+
+@torch.no_grad()
+def disagreement_of(
+    surface: Float[Tensor, "n 3"], place: Similarity, others: Sequence[tuple[SDF, Similarity]]
+) -> float:
+    """How far the farthest other end lies, in the mean, from points of a surface; in sizes of the latter."""
+    apart = [float(distances(surface, sdf, other).mean() * other.scale / place.scale) for sdf, other in others]
+    return max(apart, default=0.0)
+
+
+@torch.no_grad()
+def surface_points(sdf: SDF, count: int, like: Tensor, seed: int = 0) -> Float[Tensor, "n 3"]:
+    """Returns points on a surface in the unit sphere, by Newton steps from points about it; some fall off."""
+    random = torch.Generator().manual_seed(seed)
+    points = torch.rand(20 * count, 3, generator=random).to(like) * 2 - 1
+    points = points[points.norm(dim=-1) < 1]
+    near = sdf(points).abs().argsort()[: 2 * count]
+    points = points[near]
+    for _ in range(4):
+        with torch.enable_grad():
+            at = points.detach().requires_grad_()
+            values = sdf(at)
+            (slope,) = torch.autograd.grad(values.sum(), at)
+        points = points - (values.detach() / slope.square().sum(-1).clamp_min(0.1))[:, None] * slope
+    return points[(points.norm(dim=-1) < 1) & (sdf(points).abs() < 1e-2)][:count]
+
+
+def _blocked_share(scan: Scan, sdf: SDF, place: Similarity) -> float:
+    """Of the rays that pass the unit sphere before their end, the share that passes through the shape."""
+    rays = place.rays_in_object(scan.free)
+    bounds = meet_sphere(rays)
+    far = bounds.far.minimum((scan.free_until - 2 * scan.noise) / place.scale - BLOCKED)
+    passing = bounds.near < far
+    if not passing.any():
+        return 0.0
+    chosen = passing.nonzero()[:, 0]
+    chosen = chosen[:: -(-len(chosen) // MOST_RAYS)]
+    rays = rays[chosen]
+    near, far = bounds.near[chosen], far[chosen]
+    shares = (torch.arange(RAY_SAMPLES).to(far) + 0.5) / RAY_SAMPLES
+    t = near[:, None] + (far - near)[:, None] * shares
+    values = sdf(rays.origins[:, None] + t[..., None] * rays.directions[:, None])
+    return float((values.amin(1) < -BLOCKED / 4).float().mean())
