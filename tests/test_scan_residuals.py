@@ -21,7 +21,7 @@ def problem(points: Tensor, rays: Rays, until: Tensor, free: int, **options: boo
     decoder = Decoder(NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=())).double()
     prior = prior_of(torch.randn(9, 4).double())
     place = Similarity(PLACE.rotation.double(), PLACE.translation.double(), PLACE.scale.double())
-    state = PlacedCode(0, torch.tensor([0.3, -0.2, 0.5]).double(), place)
+    state = PlacedCode(0, prior.mean, torch.tensor([0.3, -0.2, 0.5]).double(), place)
     up = torch.tensor([0.0, 1.0, 0.0]).double()
     sample = ScanSample(points.double(), Rays(rays.origins.double(), rays.directions.double()), until.double(), free)
     return ScanProblem(decoder, prior, sample, 0.1, [Start(1.8, up)], 0.1, 8, **options), state
@@ -83,8 +83,9 @@ def test_free_rays_count_where_they_enter_the_shape_and_hits_where_they_miss_it(
     assert (of_rays(hits) > 0).all()
     in_object = state.place.rays_in_object(fit.sample.rays)
     meets = (torch.linalg.cross(in_object.origins, in_object.directions).norm(dim=-1) < 1).sum()
-    assert 0 < len(of_rays(free)) < meets
-    assert len(of_rays(free)) + len(of_rays(hits)) == meets, "each ray that meets the sphere is one or the other"
+    assert 0 < len(of_rays(hits)) < meets
+    both = len(of_rays(free)) + len(of_rays(hits))
+    assert meets <= both < 2 * meets, "each ray that meets the sphere is one or the other, or both within the margin"
 
 
 def test_nothing_counts_behind_the_end_of_a_free_ray() -> None:

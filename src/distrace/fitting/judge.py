@@ -10,11 +10,11 @@ from torch import Tensor
 from distrace.data.scan import Scan
 from distrace.fields.base import SDF
 from distrace.pose import Similarity
-from distrace.rays import meet_sphere
+from distrace.rays import Bounds, meet_sphere
+from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 NEAR = 0.03  # of the size: a point that near to the surface is explained by it
-BLOCKED = 0.03  # of the size: a ray that passes that deep through the shape contradicts it
-RAY_SAMPLES = 24
+BLOCKED = 0.03  # of the size: a shape that far before the end of a ray blocks it
 MOST_RAYS = 600
 MOST_NOISE = 0.02  # of the size, that excuses a distance
 LEAST_REACH = (0.4, 0.2)  # radius of the scan in sizes, least of what is trusted, and of what has not failed
@@ -121,7 +121,5 @@ def _blocked_share(scan: Scan, sdf: SDF, place: Similarity) -> float:
     chosen = chosen[:: -(-len(chosen) // MOST_RAYS)]
     rays = rays[chosen]
     near, far = bounds.near[chosen], far[chosen]
-    shares = (torch.arange(RAY_SAMPLES).to(far) + 0.5) / RAY_SAMPLES
-    t = near[:, None] + (far - near)[:, None] * shares
-    values = sdf(rays.origins[:, None] + t[..., None] * rays.directions[:, None])
-    return float((values.amin(1) < -BLOCKED / 4).float().mean())
+    trace = sphere_trace(sdf, rays, Bounds(near, far), TraceConfig(coarse_levels=0))
+    return float(trace.hit.float().mean())

@@ -23,6 +23,7 @@ GROWTH = 0.25  # standard deviation of the logarithm of the size, about the size
 EFFECTIVE_POINTS = 200.0  # what all points count together, however many: errors of a shape are alike nearby
 EFFECTIVE_RAYS = 600.0  # the same, of rays
 FINE_SAMPLES = 4  # points about the least sample of a ray
+MARGIN = 0.7  # deviations that a free ray keeps from the surface
 
 
 @dataclass(frozen=True)
@@ -106,15 +107,16 @@ class ScanProblem:
         return [self._residuals(*each) for each in zip(states, codes, wrong, strict=True)]
 
     @torch.no_grad()
-    def _wrong(self, field: BatchField, states: Sequence[PlacedCode]) -> list[Tensor]:
+    def _wrong(self, field: BatchField, states: Sequence[PlacedCode]) -> list[tuple[Tensor, int]]:
         """Returns, of each state, where rays are nearest to the inside: of free ones that enter it, and hits that miss.
 
+        Free ones come first; their number is returned, too. They keep a margin, since thin sheets hardly have an inside.
         The points are in the scan's frame, so that they stay where they are when the state moves.
         """
         sample = self.sample
         count = len(sample.until)
         if not count:
-            return [sample.points[:0]] * len(states)
+            return [(sample.points[:0], 0)] * len(states)
         rays = [state.place.rays_in_object(sample.rays) for state in states]
         origins = torch.stack([each.origins for each in rays])
         directions = torch.stack([each.directions for each in rays])
@@ -130,11 +132,12 @@ class ScanProblem:
         t = t.gather(2, where[..., None])[..., 0]
         self._refine(field, Rays(origins, directions), t, least, width, meets)
         is_free = torch.arange(count, device=t.device) < sample.free
-        wrong = meets & torch.where(is_free, least < 0, least > 0)
+        wrong = meets & torch.where(is_free, least * scale < MARGIN * self.deviation, least > 0)
         at = origins + t[..., None] * directions
         for state in states:
             self.evaluations[state.start] += count * self.samples
-        return [state.place.to_world(at[k, wrong[k]]) for k, state in enumerate(states)]
+        free = (wrong & is_free).sum(1).tolist()
+        return [(state.place.to_world(at[k, wrong[k]]), free[k]) for k, state in enumerate(states)]
 
     def _refine(
         self, field: BatchField, rays: Rays, t: Tensor, least: Tensor, width: Tensor, meets: Bool[Tensor, "starts n"]
@@ -152,10 +155,11 @@ class ScanProblem:
         t[start, ray] = along.gather(0, where[None])[0, better]
         least[start, ray] = values[better]
 
-    def _residuals(self, state: PlacedCode, code: Tensor, wrong: Tensor) -> Residuals:
+    def _residuals(self, state: PlacedCode, code: Tensor, wrong: tuple[Tensor, int]) -> Residuals:
         place = state.place
         sample = self.sample
-        points = place.to_object(torch.cat([sample.points, wrong]))
+        at_rays, free = wrong
+        points = place.to_object(torch.cat([sample.points, at_rays]))
         values, gradient, by_code = extended(self.decoder, points, code)
         self.evaluations[state.start] += len(values)
         factor = place.scale / self.deviation
@@ -165,10 +169,12 @@ class ScanProblem:
         jacobian = torch.cat([by_code @ self.prior.basis[:, : len(state.w)] * factor, by_place], dim=1)
         weights = values.new_full((len(values),), EFFECTIVE_POINTS / max(len(sample.points), 1))
         weights[len(sample.points) :] = EFFECTIVE_RAYS / max(len(sample.until), 1)
+        off = values * factor
+        off[len(sample.points) : len(sample.points) + free] -= MARGIN
         beliefs, by_unknowns = self._beliefs(state)
         jacobian = torch.cat([jacobian, SMALL * by_unknowns])
         return Residuals(
-            torch.cat([values * factor, SMALL * beliefs]),
+            torch.cat([off, SMALL * beliefs]),
             jacobian if self.moves else jacobian[:, : len(state.w)],
             torch.cat([weights, torch.full_like(beliefs, SMALL**-2)]),
         )
