@@ -110,7 +110,7 @@ class ScanProblem:
     def _wrong(self, field: BatchField, states: Sequence[PlacedCode]) -> list[tuple[Tensor, int]]:
         """Returns, of each state, where rays are nearest to the inside: of free ones that enter it, and hits that miss.
 
-        Free ones come first; their number is returned, too. They keep a margin, since thin sheets hardly have an inside.
+        Free ones come first; their number is returned, too. They keep a margin, as thin sheets hardly have an inside.
         The points are in the scan's frame, so that they stay where they are when the state moves.
         """
         sample = self.sample
