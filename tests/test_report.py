@@ -16,6 +16,7 @@ from PIL import Image
 
 from distrace.camera import Camera
 from distrace.fields.primitives import sphere
+from distrace.fitting.judge import Verdict
 from distrace.metrics import Chamfer
 from distrace.render import render
 from distrace.report import charts, scene
@@ -70,6 +71,7 @@ def completion() -> Completion:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.62)
     points = np.asarray(mesh.vertices)
     return Completion(
+        verdict=Verdict("trusted", 0.99, 0.0, 0.0, 0.97, "99% of the points lie on the surface"),
         title="Sphere <b>&</b> co",
         observed_depth=depth,
         observed_mask=truth.mask,

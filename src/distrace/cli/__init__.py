@@ -41,7 +41,11 @@ COMMANDS: Commands = {
     ),
     "render": Lazy("distrace.cli.show", "Render", "Render one view: depth, normals, mask and a shaded picture."),
     "mesh": Lazy("distrace.cli.show", "Mesh", "Extract a mesh by marching cubes."),
-    "complete": Lazy("distrace.cli.complete", "Complete", "Complete a shape from one depth view or a point cloud."),
+    "complete": Lazy(
+        "distrace.cli.complete",
+        "Complete",
+        "Complete a shape from a depth image, an observation or a point cloud, wherever the object is.",
+    ),
     "pose": Lazy("distrace.cli.pose", "Pose", "Find the camera of one view of a known shape."),
     "multiview": Lazy(
         "distrace.cli.multiview", "Multiview", "Find a shape and its placement from photographs with known cameras."

@@ -131,7 +131,7 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up
     if floor is not None:
         up = Up(floor.normal, floor.normal[None], TOLD_TILT)
     points = scene.masked(inside).points()
-    kept = object_points(points, floor if isolate else None)
+    kept = object_points(points, floor, 1.0) if isolate else object_points(points, None)
     pixels = inside.nonzero()[~kept]
     inside = inside.index_put((pixels[:, 0], pixels[:, 1]), torch.tensor(False))
     mask = None if isolate else mask
@@ -247,7 +247,7 @@ def find_floor(points: Float[Tensor, "n 3"], up: Up) -> Floor | None:
     return Floor(normal, float(supports.mean(0) @ normal), thickness)
 
 
-def object_points(points: Float[Tensor, "n 3"], floor: Floor | None) -> Bool[Tensor, "n"]:
+def object_points(points: Float[Tensor, "n 3"], floor: Floor | None, share: float = PIECE_SHARE) -> Bool[Tensor, "n"]:
     """Returns which points belong to the largest pieces: those of the floor, and of small separate pieces, do not."""
     kept = torch.ones(len(points), dtype=torch.bool)
     if floor is not None:
@@ -256,7 +256,7 @@ def object_points(points: Float[Tensor, "n 3"], floor: Floor | None) -> Bool[Ten
         return torch.ones_like(kept)
     pieces = _pieces(points[kept])
     counts = pieces.bincount()
-    largest = points[kept][counts[pieces] >= PIECE_SHARE * counts.max()]
+    largest = points[kept][counts[pieces] >= share * counts.max()]
     low, high = largest.amin(0), largest.amax(0)
     margin = PIECE_MARGIN * (high - low)
     return kept & ((points >= low - margin) & (points <= high + margin)).all(-1)
