@@ -76,7 +76,7 @@ def test_free_rays_count_where_they_enter_the_shape_and_hits_where_they_miss_it(
     count = 60
     fit, state = problem(torch.empty(0, 3), across(count), torch.full((count,), torch.inf), count)
     with torch.no_grad():  # a field of both signs
-        samples = fit.decoder.field(fit.code(state))(0.5 * torch.randn(500, 3).double())
+        samples = fit.decoder.field(state.code(fit.prior))(0.5 * torch.randn(500, 3).double())
         fit.decoder.lin3.bias -= samples.atanh().median()
     (free,) = fit.residuals([state])
     assert (of_rays(free) < 0).all()
@@ -99,5 +99,5 @@ def test_nothing_counts_behind_the_end_of_a_free_ray() -> None:
 def test_beyond_the_sphere_the_distance_to_it_is_added() -> None:
     fit, state = problem(torch.empty(0, 3), *nothing(), 0)
     direction = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, -2.0]]).double(), dim=-1)
-    values, _, _ = extended(fit.decoder, torch.cat([direction, 3 * direction]), fit.code(state))
+    values, _, _ = extended(fit.decoder, torch.cat([direction, 3 * direction]), state.code(fit.prior))
     torch.testing.assert_close(values[1], values[0] + 2)

@@ -5,14 +5,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import torch
 import tyro
+from torch import Tensor
 
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
 from distrace.cli.console import console
-from distrace.files import save_arrays, written
+from distrace.files import save_arrays, save_json, written
+from distrace.metrics import Chamfer
+from distrace.pose import Similarity
 from distrace.render import Buffers
 from distrace.report.completion_page import View
 from distrace.report.page import short
@@ -101,6 +105,25 @@ def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
     """Writes a mesh in the format of the name: PLY or GLB."""
     with written(path) as file:
         mesh.export(file, file_type=path.suffix.removeprefix("."))
+
+
+def save_code(folder: Path, code: Tensor, place: Similarity) -> None:
+    """Writes a fitted code, and the placement of its shape in the frame of the input."""
+    with written(folder / "code.npy") as file:
+        np.save(file, code.cpu().numpy())
+    save_json(folder / "placement.json", {"T_input_object": place.T_world_object.tolist()})
+
+
+def save_completed(folder: Path, mesh: "trimesh.Trimesh") -> None:
+    """Writes a completed mesh in both formats."""
+    save_mesh(folder / "mesh.ply", mesh)
+    save_mesh(folder / "mesh.glb", mesh)
+
+
+def chamfer_facts(distances: Chamfer) -> tuple[dict[str, float], str]:
+    """Returns the distance to a true surface for `result.json`, and as a line."""
+    facts = {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+    return facts, f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:

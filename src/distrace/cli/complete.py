@@ -97,19 +97,17 @@ class Complete:
         fit = chosen(iterations=iterations, starts=self.starts, seed=self.seed)
         full = load_cloud(path) if cloud else load_view(path)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
-        self._check(known, chosen)
+        self._check(path, known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
         return complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
 
-    def _check(self, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
+    def _check(self, path: Path, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
         """Raises `ValueError` where nothing that the solver uses is left."""
         if isinstance(known, View):
             used = known if chosen is FitConfig else known.without("normal")
             if not used.observed.any():
                 left = f" without its {' and '.join(self.ignore)}" if self.ignore else ""
-                raise ValueError(
-                    f"{next(iter(self.inputs))}{left} has no depth and no mask of the object to complete it from"
-                )
+                raise ValueError(f"{path}{left} has no depth and no mask of the object to complete it from")
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from distrace import shading
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import save_mesh
+from distrace.cli.common import chamfer_facts, save_code, save_completed, save_mesh
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.data.scan import canonical_scan
-from distrace.files import save_json, save_text, written
+from distrace.files import save_text
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.free_space import LEFT_OUT, completed
@@ -81,12 +81,9 @@ def complete(run: Run, task: Task) -> Verdict:
     """Fits, and writes mesh, placement, code, pictures, page and `result.json`."""
     steps = _fitted(task)
     last = steps[-1]
-    with written(run.out / "code.npy") as file:
-        np.save(file, last.code.cpu().numpy())
+    save_code(run.out, last.code, Similarity.identity())
     outcome = _outcome(task, steps)
-    save_mesh(run.out / "mesh.ply", outcome.mesh)
-    save_mesh(run.out / "mesh.glb", outcome.mesh)
-    save_json(run.out / "placement.json", {"T_input_object": Similarity.identity().T_world_object.tolist()})
+    save_completed(run.out, outcome.mesh)
     for step in outcome.others:
         save_mesh(run.out / f"plausible-{step.start + 1}.ply", task.surface(step))
     content = _page_content(task, outcome)
@@ -97,9 +94,9 @@ def complete(run: Run, task: Task) -> Verdict:
     facts |= content.verdict.facts()
     lines = [f"{content.verdict.name}: {content.verdict.reason}"]
     if outcome.chamfer:
-        distances = outcome.chamfer
-        lines += [f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"]
-        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+        distances, line = chamfer_facts(outcome.chamfer)
+        lines.append(line)
+        facts |= distances
     run.finish(facts, *lines)
     return content.verdict
 

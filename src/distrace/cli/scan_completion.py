@@ -9,18 +9,19 @@ import torch
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import save_mesh
+from distrace.cli.common import chamfer_facts, save_code, save_completed
 from distrace.cli.console import Run, console, progress
 from distrace.data.scan import Scan
-from distrace.files import save_json, save_text, written
+from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
 from distrace.fitting.judge import Verdict
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
-from distrace.render import Buffers, render
+from distrace.render import render
 from distrace.report import scan_page as report
+from distrace.report.completion_page import View
 
 if TYPE_CHECKING:
     import trimesh
@@ -49,22 +50,19 @@ class ScanTask:
 def complete_scan(run: Run, task: ScanTask) -> Verdict:
     """Fits, and writes code, placement, meshes, pictures, page and `result.json`."""
     fit = _fitted(task)
-    with written(run.out / "code.npy") as file:
-        np.save(file, fit.code.cpu().numpy())
     place = fit.place.to("cpu")
-    save_json(run.out / "placement.json", {"T_input_object": place.T_world_object.tolist()})
+    save_code(run.out, fit.code, place)
     mesh = extract_mesh(task.model.field(fit.code), task.mesh)
     mesh.apply_transform(place.T_world_object.double().numpy())
-    save_mesh(run.out / "mesh.ply", mesh)
-    save_mesh(run.out / "mesh.glb", mesh)
+    save_completed(run.out, mesh)
     pictures = _pictures(task, fit, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
     facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}
     lines = [f"{fit.verdict.name}: {fit.verdict.reason}"]
     if task.truth is not None:
-        distances = chamfer(_in_object(mesh, place), _in_object(task.truth, place))
-        lines.append(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
-        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+        distances, line = chamfer_facts(chamfer(_in_object(mesh, place), _in_object(task.truth, place)))
+        lines.append(line)
+        facts |= distances
     with run.optional("report.html"):
         content = report.ScanCompletion(
             verdict=fit.verdict,
@@ -107,11 +105,7 @@ def _pictures(task: ScanTask, fit: ScanFit, place: Similarity) -> dict[str, shad
         cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, PICTURE / max(view.depth.shape))))
     for name, (azimuth, elevation) in VIEWS.items():
         cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
-    return {name: _clay(render(sdf, camera.to(task.mesh.device))) for name, camera in cameras.items()}
-
-
-def _clay(buffers: Buffers) -> shading.Picture:
-    return shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
+    return {name: View.of(render(sdf, camera.to(task.mesh.device))).shaded for name, camera in cameras.items()}
 
 
 def _in_object(shape: "trimesh.Trimesh | np.ndarray", place: Similarity) -> "trimesh.Trimesh | np.ndarray":

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
+from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
 import torch
@@ -120,10 +120,12 @@ def read_scene(path: Path) -> tuple[View, Bool[Tensor, "height width"] | None]:
 
 def is_canonical(path: Path) -> bool:
     """Returns whether a file says that its object lies as the model's shapes do: an `.npz` with `frame` "canonical"."""
+    if not is_zipfile(path):  # NumPy would read all of an NPY
+        return False
     try:
         with np.load(path, allow_pickle=False) as arrays:
             return "frame" in arrays.files and str(arrays["frame"]) == CANONICAL
-    except (OSError, EOFError, ValueError, AttributeError, TypeError, BadZipFile):
+    except (OSError, EOFError, ValueError, BadZipFile):
         return False  # whoever reads it says what is wrong
 
 

@@ -10,6 +10,7 @@ from math import inf
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad
 
 from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
@@ -121,7 +122,7 @@ def _fitted(
     began: float,
 ) -> ScanFit:
     least, best = ends[0]
-    codes = [state.base + prior.basis[:, : len(state.w)] @ state.w for _, state in ends]
+    codes = [state.code(prior) for _, state in ends]
     sdf = decoder.field(codes[0])
     equal = [k for k, (loss, _) in enumerate(ends) if k and loss <= (1 + EQUAL) * least]
     others = tuple((codes[k], ends[k][1].place) for k in equal)
@@ -141,10 +142,7 @@ def _likely(state: PlacedCode, scan: Scan) -> Start:
 
 def _widened(state: PlacedCode, dimensions: int) -> PlacedCode:
     """Returns a state with more coordinates, which are zero, or fewer."""
-    w = state.w.new_zeros(dimensions)
-    count = min(dimensions, len(state.w))
-    w[:count] = state.w[:count]
-    return replace(state, w=w)
+    return replace(state, w=pad(state.w, (0, dimensions - len(state.w))))
 
 
 def _loss(descent: Descent[PlacedCode]) -> float:

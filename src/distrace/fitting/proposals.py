@@ -14,6 +14,7 @@ from torch.nn.functional import interpolate
 from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import BFloat16Decoder
+from distrace.fitting.ray_sampling import drawn
 from distrace.fitting.scan_residuals import PlacedCode
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -144,7 +145,7 @@ class Probes:
         """Draws points; those of free space lie on rays, at most a radius before and behind the object's middle."""
         random = torch.Generator().manual_seed(seed)
         deviation = DEVIATION * scan.radius
-        surface = scan.points[torch.randperm(len(scan.points), generator=random)[:SCAN_POINTS]]
+        surface = drawn(scan.points, SCAN_POINTS, random)
         chosen = torch.randperm(len(scan.free_until), generator=random)[:SCAN_POINTS]
         rays = scan.free[chosen]
         middle = ((scan.centre - rays.origins) * rays.directions).sum(-1)

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +13,7 @@ from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import BFloat16Decoder
 from distrace.fitting.code_jacobian import SMALL, derivatives
+from distrace.fitting.ray_sampling import drawn
 from distrace.fitting.solver import Residuals
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -35,6 +36,9 @@ class PlacedCode:
     w: Float[Tensor, "dimensions"]  # added, in leading coordinates of the prior
     place: Similarity
 
+    def code(self, prior: Prior) -> Float[Tensor, "length"]:
+        return self.base + prior.basis[:, : len(self.w)] @ self.w
+
 
 @dataclass(frozen=True)
 class Start:
@@ -56,15 +60,13 @@ class ScanSample:
     @staticmethod
     def drawn(scan: Scan, points: int, rays: int, random: torch.Generator) -> "ScanSample":
         """Returns at most so many points and rays, at random."""
-        chosen = torch.randperm(len(scan.points), generator=random)[:points]
+        chosen = drawn(scan.points, points, random)
         hits = torch.randperm(len(scan.hits.origins), generator=random)[: rays // 2]
         free = torch.randperm(len(scan.free_until), generator=random)[: rays - len(hits)]
         origins = torch.cat([scan.free.origins[free], scan.hits.origins[hits]])
         directions = torch.cat([scan.free.directions[free], scan.hits.directions[hits]])
-        until = torch.cat(
-            [scan.free_until[free], torch.full_like(hits, torch.inf, dtype=torch.float32).to(scan.points)]
-        )
-        return ScanSample(scan.points[chosen], Rays(origins, directions), until, len(free))
+        until = torch.cat([scan.free_until[free], scan.points.new_full((len(hits),), torch.inf)])
+        return ScanSample(chosen, Rays(origins, directions), until, len(free))
 
 
 @dataclass
@@ -85,9 +87,6 @@ class ScanProblem:
     moves: bool = True  # whether the placement is unknown
     evaluations: Counter[int] = field(default_factory=Counter)  # of the field, by each start
 
-    def code(self, state: PlacedCode) -> Float[Tensor, "length"]:
-        return state.base + self.prior.basis[:, : len(state.w)] @ state.w
-
     def retract(self, states: Sequence[PlacedCode], steps: Sequence[Tensor]) -> list[PlacedCode]:
         """Returns states after steps; shifts are in units of the object's size."""
         moved = []
@@ -98,11 +97,11 @@ class ScanProblem:
                 motion = step[count:].clone()
                 motion[3:6] *= place.scale
                 place = place.moved(motion)
-            moved.append(PlacedCode(state.start, state.base, state.w + step[:count], place))
+            moved.append(replace(state, w=state.w + step[:count], place=place))
         return moved
 
     def residuals(self, states: Sequence[PlacedCode]) -> list[Residuals]:
-        codes = torch.stack([self.code(state) for state in states])
+        codes = torch.stack([state.code(self.prior) for state in states])
         wrong = self._wrong(self.decoder.fields(codes), states)
         return [self._residuals(*each) for each in zip(states, codes, wrong, strict=True)]
 

@@ -43,9 +43,7 @@ def scan_page(completion: ScanCompletion) -> str:
         _space(completion),
         section("Verdict", paragraph(ABOUT), table(("", ""), _verdict_rows(completion.verdict))),
         _placement(completion.place),
-        section(
-            "Loss", curves({name: list(curve) for name, curve in completion.losses.items()}, "iteration", "loss", True)
-        ),
+        section("Loss", curves(completion.losses, "iteration", "loss", True)),
         section("Facts", table(("", ""), list(completion.facts.items()))),
     ]
     return page("A shape completed in the frame of its input", lead, sections)
