@@ -86,6 +86,7 @@ class Memory:
             for size in growth.MEASURED:
                 mib = growth.peak_memory(self.model, self.code, size)
                 rows.append({"model": self.model, "pixels": size, "mib": mib})
+                save_json(run.out / "rows.json", rows)
                 bar.advance(f"{size} × {size}: {mib:.0f} MiB")
         show_table(rows)
         run.finish({"rows": rows, **origin()})
