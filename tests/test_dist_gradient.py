@@ -70,7 +70,7 @@ def test_a_ray_with_fewer_queries_has_the_gradient_of_those() -> None:
 def test_misses_stay_infinite_and_give_no_gradient() -> None:
     radius = torch.tensor(0.5, dtype=f64, requires_grad=True)
     past = Rays(FACING.origins + torch.tensor([0.9, 0, 0], dtype=f64), FACING.directions)
-    distance = attach_dist(sphere(radius), past, march(sphere(radius), past, meet_sphere(past)))
+    distance = attach_dist(sphere(radius), past, march(sphere(radius), past, meet_sphere(past)), 5)
     assert distance.item() == torch.inf
     assert torch.autograd.grad(distance.sum(), radius)[0] == 0
 

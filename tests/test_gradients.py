@@ -209,9 +209,9 @@ def test_a_face_at_a_grazing_angle_is_among_the_boxs_pixels(ratios) -> None:
 def test_a_subject_counts_what_it_asked_for() -> None:
     model = Model("ball", ball(1, 8).decoder, torch.zeros(1, 1), ("ball",))
     sphere_subject, *_ = subjects(model, 0, 16)
-    assert sphere_subject.tally.evaluations == 0
+    assert sphere_subject.sdf.evaluations == 0
     list(ratio_rows(sphere_subject))
-    assert sphere_subject.tally.evaluations > 1000
+    assert sphere_subject.sdf.evaluations > 1000
 
 
 def test_rays_of_a_moved_camera_are_those_that_are_compared() -> None:

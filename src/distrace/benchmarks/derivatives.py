@@ -1,9 +1,9 @@
 """Rows of `bench gradients`: exact derivatives and DIST's against differences, and the time of a backward pass."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from statistics import median
 
@@ -13,25 +13,22 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives, differences
-from distrace.checking.dist_gradient import Queries, attach_dist, march
+from distrace.checking.dist_gradient import attach_dist, march
 from distrace.checking.gradcheck import Compared, compare
-from distrace.checking.moves import Change, Move, Tally, all_moves, decoder_changes
+from distrace.checking.moves import Change, Move, counted_moves, decoder_changes
 from distrace.checking.retrace import DOUBLE, Retraced
 from distrace.checkpoints.model import Model
-from distrace.fields.base import SDF
+from distrace.fields.base import SDF, Counted
 from distrace.fields.primitives import box, sphere
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 
-EXACT = "exact"
 QUERIES = (1, 3, 5)  # of DIST's gradient
 RADIUS = 0.5  # of the sphere
 HALF = (0.5, 0.3, 0.3)  # sizes of the box
 COUNT = 9 * (1 + len(QUERIES))  # of rows
 SIZE = 64  # pixels along each side
 SHARE = 0.1  # of the median derivative: pixels with a smaller one have no ratio
-
-View = Callable[[SDF, Camera], Images]
 
 
 @dataclass(frozen=True)
@@ -65,76 +62,47 @@ class Timing:
 
 @dataclass(frozen=True)
 class Subject:
-    """A field, its camera, and the moves along which derivatives are taken."""
+    """A field, its camera, and the moves along which derivatives are taken: the first component of each parameter."""
 
     field: str
-    sdf: SDF
+    sdf: Counted
     camera: Camera
     moves: dict[str, Move]
-    tally: Tally
-
-    @staticmethod
-    def of(field: str, sdf: SDF, camera: Camera, changes: dict[str, Change], parameters: tuple[str, ...]) -> "Subject":
-        """Takes the first component of each parameter."""
-        tally = Tally()
-        moves = all_moves(sdf, camera, changes)
-        counted = {name: tally.move(next(iter(moves[name].values()))) for name in parameters}
-        return Subject(field, tally.field(sdf), camera, counted, tally)
 
 
 def subjects(model: Model, code: int, size: int) -> list[Subject]:
     """Returns a sphere, a box that shows a face at 6° from its plane, and a decoder; all in float64."""
-    like = torch.zeros(3, dtype=torch.float64)
-    half = like.new_tensor(HALF)
-    view_sphere, view_box, view_decoder = (
-        Camera.orbit(*angles, 4.97, focal_mm=focal_mm, height=size, width=size, dtype=like.dtype)
-        for angles, focal_mm in (((30, 20), 130), ((81, 8), 130), ((30, 20), 75))  # each shape fills its image
-    )
+    half = torch.tensor(HALF, dtype=torch.float64)
     decoder = deepcopy(model.decoder).double().cpu()
     latent = model.codes[code].detach().double().cpu()
-    camera_moves = ("camera translation", "focal length")
-    return [
-        Subject.of(
-            "sphere",
-            sphere(RADIUS),
-            view_sphere,
-            {"radius": lambda h: sphere(RADIUS + h)},
-            ("radius", "camera translation"),
-        ),
-        Subject.of("box", box(half), view_box, {"size": lambda h: box(half + h)}, ("size", *camera_moves)),
-        Subject.of(
-            "decoder",
-            decoder.field(latent),
-            view_decoder,
-            decoder_changes(decoder, latent),
-            ("code", "weights", *camera_moves),
-        ),
+    lens = ("focal length",)
+    return [  # the focal lengths let each shape fill its image
+        _subject("sphere", sphere(RADIUS), _camera(30, 20, 130, size), {"radius": lambda h: sphere(RADIUS + h)}),
+        _subject("box", box(half), _camera(81, 8, 130, size), {"size": lambda h: box(half + h)}, lens),
+        _subject("decoder", decoder.field(latent), _camera(30, 20, 75, size), decoder_changes(decoder, latent), lens),
     ]
+
+
+def _camera(azimuth: float, elevation: float, focal_mm: float, size: int) -> Camera:
+    return Camera.orbit(azimuth, elevation, 4.97, focal_mm=focal_mm, height=size, width=size, dtype=torch.float64)
+
+
+def _subject(name: str, sdf: SDF, camera: Camera, changes: dict[str, Change], moved: tuple[str, ...] = ()) -> Subject:
+    """Returns a field with its own changes, translations of the camera, and the other moves of it in `moved`."""
+    counted = Counted(sdf)
+    moves = counted_moves(counted, camera, changes)
+    parameters = (*changes, "camera translation", *moved)
+    return Subject(name, counted, camera, {key: next(iter(moves[key].values())) for key in parameters})
 
 
 def ratio_rows(subject: Subject) -> Iterator[tuple[RatioRow, Float[Tensor, "height width"]]]:
     """Yields each parameter by each method, with the image of the ratio; NaN where there is none."""
     view = Retraced.of(subject.sdf, subject.camera, 1.0, DOUBLE)
+    hit = view.trace.hit
     rays = subject.camera.rays()
     marched = march(subject.sdf, rays, meet_sphere(rays), queries=max(QUERIES))
-    missed = marched.distance[view.trace.hit].isinf()
     values = view.retraced_hits(subject.sdf, subject.camera)
-    for parameter, move in subject.moves.items():
-        central, kinks = differences(partial(_moved, view.retraced_hits, move), values, DOUBLE.step, values["depth"])
-        kink = kinks["depth"].masked_fill(missed, torch.nan)
-        for method, render_depth in _methods(view, marched).items():
-            slopes = derivatives(partial(_moved, render_depth, move), values["depth"])
-            compared = compare(parameter, slopes["depth"], central["depth"], kink, DOUBLE)
-            yield _ratio_row(view, (subject.field, parameter, method), compared)
-
-
-def _moved(view: View, move: Move, h: Tensor) -> Images:
-    return view(*move(h))
-
-
-def _methods(view: Retraced, marched: Queries) -> dict[str, View]:
-    """Returns each method's differentiable depth of the hits."""
-    hit = view.trace.hit
+    like = values["depth"]
 
     def exact(sdf: SDF, camera: Camera) -> Images:
         return {"depth": Buffers(sdf, camera.rays(), camera.cosines(), view.trace, view.radius).depth[hit]}
@@ -142,36 +110,47 @@ def _methods(view: Retraced, marched: Queries) -> dict[str, View]:
     def dist(queries: int, sdf: SDF, camera: Camera) -> Images:
         return {"depth": camera.depth(attach_dist(sdf, camera.rays(), marched, queries))[hit]}
 
-    return {EXACT: exact} | {f"DIST, k = {k}": partial(dist, k) for k in QUERIES}
+    methods = {"exact": exact} | {f"DIST, k = {k}": partial(dist, k) for k in QUERIES}
+    for parameter, move in subject.moves.items():
+        central, kinks = differences(lambda h, move=move: view.retraced_hits(*move(h)), values, DOUBLE.step, like)
+        kink = kinks["depth"].masked_fill(marched.distance[hit].isinf(), torch.nan)
+        for method, images in methods.items():
+            slopes = derivatives(lambda h, move=move, images=images: images(*move(h)), like)
+            compared = compare(parameter, slopes["depth"], central["depth"], kink, DOUBLE)
+            ratio = _ratio(compared)
+            row = _ratio_row((subject.field, parameter, method), compared.error, ratio[~ratio.isnan()])
+            yield row, torch.full_like(view.trace.distance, torch.nan).masked_scatter(hit, ratio)
 
 
-def _ratio_row(view: Retraced, names: tuple[str, str, str], compared: Compared) -> tuple[RatioRow, Tensor]:
-    error = compared.error
+def _ratio(compared: Compared) -> Float[Tensor, "n"]:
+    """Returns derivative by difference; NaN for a pixel that is left out, or has a small derivative."""
     difference = compared.difference[:, 0]
-    valid = ~error.isnan()
-    large = valid & (difference.abs() > SHARE * difference.abs().nanmedian())
-    ratio = (compared.derivative[:, 0] / difference).masked_fill(~large, torch.nan)
-    low, middle, high = ratio[large].quantile(ratio.new_tensor([0.1, 0.5, 0.9])).tolist()
-    row = RatioRow(
+    large = difference.abs() > SHARE * difference.abs().nanmedian()
+    ratio = compared.derivative[:, 0] / difference
+    return ratio.masked_fill(compared.error.isnan() | ~large, torch.nan)
+
+
+def _ratio_row(names: tuple[str, str, str], error: Float[Tensor, "n"], ratio: Float[Tensor, "m"]) -> RatioRow:
+    left_out = error.isnan()
+    low, middle, high = ratio.quantile(ratio.new_tensor([0.1, 0.5, 0.9])).tolist()
+    return RatioRow(
         *names,
         relative_error=float(error.nanmedian()),
-        worst=float(error[valid].max()),
+        worst=float(error[~left_out].max()),
         ratio=middle,
         ratio_low=low,
         ratio_high=high,
-        pixels=int(valid.sum()),
-        left_out=int((~valid).sum()),
+        pixels=int((~left_out).sum()),
+        left_out=int(left_out.sum()),
     )
-    return row, torch.full_like(view.trace.distance, torch.nan).masked_scatter(view.trace.hit, ratio)
 
 
 def timings(model: Model, code: int, camera: Camera, repeats: int) -> list[Timing]:
     """Times a depth image of the default tracer and its backward pass, by code and by camera, after a warm-up run."""
-    parameters = {"code": _with_code, "camera": _with_camera}
-    runs: dict[str, list[tuple[float, float, int]]] = {name: [] for name in parameters}
+    runs: dict[str, list[tuple[float, float, int]]] = {"code": [], "camera": []}
     for _ in range(repeats + 1):
-        for name, differentiable in parameters.items():
-            runs[name].append(_timed(*differentiable(model, code, camera)))
+        runs["code"].append(_timed(model.field(model.codes[code].detach().clone().requires_grad_()), camera))
+        runs["camera"].append(_timed(model.field(code), _attached(camera)))
     return [_timing(name, camera, times[1:] or times) for name, times in runs.items()]
 
 
@@ -182,14 +161,12 @@ def _timing(name: str, camera: Camera, times: list[tuple[float, float, int]]) ->
     return Timing(name, camera.height * camera.width, visible[0], before, after, after / before, len(times))
 
 
-def _with_code(model: Model, code: int, camera: Camera) -> tuple[SDF, Camera]:
-    return model.field(model.codes[code].detach().clone().requires_grad_()), camera
-
-
-def _with_camera(model: Model, code: int, camera: Camera) -> tuple[SDF, Camera]:
+def _attached(camera: Camera) -> Camera:
+    """Returns a copy whose intrinsics and pose require gradients."""
     intrinsics = camera.intrinsics.detach().clone().requires_grad_()
-    pose = camera.T_world_camera.detach().clone().requires_grad_()
-    return model.field(code), Camera(intrinsics, pose, camera.height, camera.width)
+    return replace(
+        camera, intrinsics=intrinsics, T_world_camera=camera.T_world_camera.detach().clone().requires_grad_()
+    )
 
 
 def _timed(sdf: SDF, camera: Camera) -> tuple[float, float, int]:

@@ -96,7 +96,7 @@ class Bench:
         times = rows_of(self.model, timings)
         show(facts)
         show(times)
-        evaluations = sum(subject.tally.evaluations for subject in subjects)
+        evaluations = sum(subject.sdf.evaluations for subject in subjects)
         run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
 
 
