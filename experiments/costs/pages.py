@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 
-from distrace.benchmarks.pages import cells
-from distrace.report.charts import courses, growth
+from distrace.benchmarks.pages import rows_table
 from distrace.report.page import Html, page, section, table
+from experiments.charts import courses, growth
 from experiments.costs.fields import FieldRow
 from experiments.costs.growth import GrowthRow
 from experiments.costs.solvers import Curve, SolverRow
@@ -30,7 +30,7 @@ def growth_page(rows: Sequence[GrowthRow]) -> str:
     for axis in dict.fromkeys(row.axis for row in rows):
         of_axis = [row for row in rows if row.axis == axis]
         charts = _charts(of_axis) if axis != "network" else []
-        parts.append(section(axis.capitalize(), table(*cells(of_axis)), *charts))
+        parts.append(section(axis.capitalize(), rows_table(of_axis), *charts))
     return page(
         "How the cost grows", "The poster's view; 256 × 256 pixels for views and networks, 64 × 64 for shapes.", parts
     )
@@ -48,7 +48,7 @@ def solvers_page(measured: Sequence[tuple[SolverRow, Curve]]) -> str:
     )
     parts = [section(observed, courses(series, "seconds", "loss")) for observed, series in charts.items()]
     rows = [row for row, _ in measured]
-    return page("Adam and Levenberg–Marquardt", lead, [section("Table", table(*cells(rows))), *parts])
+    return page("Adam and Levenberg–Marquardt", lead, [section("Table", rows_table(rows)), *parts])
 
 
 def _charts(rows: Sequence[GrowthRow]) -> list[Html]:

@@ -96,6 +96,14 @@ def error_picture(difference: Float[Array, "height width"], limit: float) -> Pic
     return _over_white(_mapped("coolwarm", np.where(seen, values, 0) / (2 * limit) + 0.5), seen)
 
 
+def difference(depth: Float[Array, "height width"], truth: Float[Array, "height width"]) -> np.ndarray:
+    """Depth − truth; NaN where one of them is not finite."""
+    first = _numpy(depth)
+    second = _numpy(truth)
+    both = np.isfinite(first) & np.isfinite(second)
+    return np.subtract(first, second, out=np.full_like(first, np.nan), where=both)
+
+
 def dots_picture(
     base: Picture, depth: Float[Array, "height width"], near: float | None = None, far: float | None = None
 ) -> Picture:
@@ -116,11 +124,6 @@ def dots_picture(
 def side_by_side(pictures: Sequence[Picture], gap: int = 8) -> Picture:
     """Pictures in a row, their upper edges aligned."""
     return grid([pictures], gap)
-
-
-def in_rows(pictures: Sequence[Picture], across: int) -> Picture:
-    """Pictures one after the other, so many in a row."""
-    return grid([pictures[k : k + across] for k in range(0, len(pictures), across)])
 
 
 def grid(rows: Sequence[Sequence[Picture]], gap: int = 8) -> Picture:

@@ -20,8 +20,8 @@ from distrace.reconstruction.losses import surface_colours
 from distrace.reconstruction.state import Reconstruction
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
-from distrace.report.page import Html, figure, page, paragraph, section, table
-from distrace.report.scene import scene
+from distrace.report.page import Html, facts_section, figure, page, paragraph, section
+from distrace.report.scene import space_section
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 from distrace.training.losses import COURSE
 
@@ -124,9 +124,9 @@ def reconstruction_page(
         [
             *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
             section("Views that were fitted to", *map(_shown, fitted_to)),
-            section("In space", scene({"Surface": mesh}, {})),
+            space_section({"Surface": mesh}),
             section("Loss", curves(course, f"× {COURSE} steps", "mean of a term", True)),
-            section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
+            facts_section(facts),
         ],
     )
 
