@@ -103,16 +103,15 @@ class _Watched:
         values, field = pruned(self.sdf, points)
         return self._counted(points, values), lambda near: self._counted(near, evaluate_checked(field, near))
 
-    def nan(self) -> str:
-        """Returns where the field was NaN, in words; empty where it never was."""
-        points = f"{self.undefined:,} of {self.evaluations:,} points within {self.radius} of the origin"
-        return f"the field is NaN at {points}" if self.undefined else ""
-
     def _counted(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         within = points.norm(dim=-1) <= self.radius
         self.evaluations += int(within.sum())
         self.undefined += int((within & values.isnan()).sum())
         return values
+
+    def __str__(self) -> str:
+        points = f"{self.undefined:,} of {self.evaluations:,} points within {self.radius} of the origin"
+        return f"the field is NaN at {points}"
 
 
 def _points_on_ball(config: MeshConfig) -> Float[Tensor, "n 3"]:
@@ -126,7 +125,7 @@ def _points_on_ball(config: MeshConfig) -> Float[Tensor, "n 3"]:
 
 def _warn_of_doubts(field: _Watched, values_on_ball: Float[Tensor, "n"], config: MeshConfig) -> None:
     if field.undefined:
-        _warn(f"{field.nan()}; the mesh may have holes there")
+        _warn(f"{field}; the mesh may have holes there")
     if (negative := int((values_on_ball < 0).sum())) > INVERTED * BALL_SAMPLES:
         share = f"{negative} of {BALL_SAMPLES} points at {config.radius} from the origin"
         _warn(f"the field is negative at {share}, so the mesh is of what surrounds the shape; is its sign inverted?")
@@ -144,7 +143,7 @@ def _values(sdf: _Watched, config: MeshConfig) -> np.ndarray:
     values = field(points)
     if not ((values < 0).any() and (values > 0).any()):
         if sdf.undefined:
-            raise ValueError(f"{sdf.nan()}, and has no zero elsewhere: there is no surface to extract")
+            raise ValueError(f"{sdf}, and has no zero elsewhere: there is no surface to extract")
         raise ValueError(
             f"the field has no zero within {config.radius} of the origin: there is no surface to extract; if"
             f" there is, the field is steeper than {config.steepest:.3g} per length: give a larger `steepest`"
@@ -204,13 +203,8 @@ def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
 
 def _whole_cells(evaluated: np.ndarray) -> np.ndarray:
     """Returns the cells whose eight corners are evaluated, marked at the corner that scikit-image reads."""
-    whole = evaluated.copy()
+    whole = evaluated
     for axis in range(3):
-        shifted = np.zeros_like(whole)
-        inner = [slice(None)] * 3
-        inner[axis] = slice(1, None)
-        before = [slice(None)] * 3
-        before[axis] = slice(None, -1)
-        shifted[tuple(inner)] = whole[tuple(inner)] & whole[tuple(before)]
-        whole = shifted
-    return whole
+        layers = np.moveaxis(whole, axis, 0)
+        whole = np.moveaxis(layers[1:] & layers[:-1], 0, axis)
+    return np.pad(whole, ((1, 0),) * 3)
