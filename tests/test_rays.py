@@ -1,7 +1,5 @@
 """Rays, and where they meet the sphere that bounds a field."""
 
-import math
-
 import pytest
 import torch
 from hypothesis import given

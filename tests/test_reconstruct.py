@@ -35,7 +35,6 @@ from distrace.reconstruction.matching import PatchMatching
 from distrace.reconstruction.multiview_depth import NO_DEPTHS
 from distrace.reconstruction.networks import (
     ColourNetwork,
-    CountedSurface,
     GridSpecs,
     HashGrid,
     SurfaceNetwork,
@@ -325,7 +324,7 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
     small = [view.at_most(32) for view in views]
     some = PixelSampler.of(small).sample(600, random)
     matching = PatchMatching.of(small, CPU)
-    surface = CountedSurface(state.surface)
+    surface = state.surface
     for shapes, pulled in ((False, set[str]()), (True, {"colour", "patches"})):
         terms = loss_terms(some, matching, surface, state.colour, random, shapes, 100.0)
         weights = list(state.surface.parameters())
