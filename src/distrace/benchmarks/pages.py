@@ -12,7 +12,7 @@ from torch import Tensor
 from distrace import shading, surface
 from distrace.benchmarks import agreement
 from distrace.benchmarks.agreement import Measured, Summary, ViewRow
-from distrace.benchmarks.derivatives import RatioRow, Timing
+from distrace.benchmarks.backward import Timing
 from distrace.benchmarks.measuring import OUTLIER, Row
 from distrace.benchmarks.random_views import Mixture
 from distrace.render import Buffers
@@ -23,8 +23,6 @@ from distrace.shading import Picture
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")
 MOST_QUERIES = 20.0  # the strongest colour
-DOUBLINGS = 3.0  # of the ratio, at the strongest colour
-ENLARGED = 4  # × the size of the maps of ratios
 SIDE = 256  # pixels; smaller pictures of views are enlarged towards it
 MARGIN = 4  # pixels around the object
 COLOURS = {"both": shading.AGREE, "missed": shading.MISSING, "added": shading.EXTRA}
@@ -82,29 +80,16 @@ def error_map(buffers: Buffers, truth: np.ndarray) -> Picture:
     return picture
 
 
-def gradients_page(rows: Sequence[RatioRow], ratios: Sequence[np.ndarray], timings: Sequence[Timing]) -> str:
+def gradients_page(rows: Sequence[Mapping[str, object]], timings: Sequence[Timing]) -> str:
     """Returns the page of `bench gradients`: derivatives against differences, and the time of a backward pass."""
-    maps: dict[str, list[Picture]] = {}
-    for line, ratio in zip(rows, ratios, strict=True):
-        maps.setdefault(f"{line.field} by {line.parameter}", []).append(ratio_map(ratio))
-    methods = ", ".join(dict.fromkeys(line.method for line in rows))
-    pictures = [figure(shading.side_by_side(by_method), f"{name}: {methods}") for name, by_method in maps.items()]
-    scale = error_ramp(f"1 / {2**DOUBLINGS:.0f} or less, or of the wrong sign", f"{2**DOUBLINGS:.0f} times or more")
     return page(
         "Gradients",
-        "Derivatives of depth at each pixel against central differences in float64: exact ones, and DIST's.",
+        "Derivatives of an image at each pixel against central differences.",
         [
             section("How large are the errors?", rows_table(rows)),
-            section("Which pixels are off? Ratio of derivative to difference", scale, *pictures),
             section("How long does a backward pass take?", rows_table(timings)),
         ],
     )
-
-
-def ratio_map(ratio: np.ndarray) -> Picture:
-    """Returns ratios as colours: grey is right, red too large, blue too small, white has none."""
-    doublings = np.log2(np.where(ratio > 0, ratio, np.where(np.isnan(ratio), np.nan, 2**-DOUBLINGS)))
-    return shading.error_picture(doublings, DOUBLINGS).repeat(ENLARGED, 0).repeat(ENLARGED, 1)
 
 
 def views_page(

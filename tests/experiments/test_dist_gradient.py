@@ -5,10 +5,10 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checking.dist_gradient import attach_dist, march
 from distrace.fields.primitives import sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.tracing.sphere_tracing import AGGRESSIVE, sphere_trace
+from experiments.costs.dist_gradient import attach_dist, march
 
 f64 = torch.float64
 FACING = Rays(torch.tensor([[0.0, 0, 5]], dtype=f64), torch.tensor([[0.0, 0, -1]], dtype=f64))

@@ -1,11 +1,9 @@
-"""Rows of `bench gradients`: exact derivatives and DIST's against differences, and the time of a backward pass."""
+"""Exact derivatives of depth, and DIST's, against finite differences: on a sphere, a box and a decoder."""
 
-import time
 from collections.abc import Iterator
 from copy import deepcopy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
-from statistics import median
 
 import torch
 from jaxtyping import Float
@@ -13,7 +11,6 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives, differences
-from distrace.checking.dist_gradient import attach_dist, march
 from distrace.checking.gradcheck import Compared, compare
 from distrace.checking.moves import Change, Move, counted_moves, decoder_changes
 from distrace.checking.retrace import DOUBLE, Retraced
@@ -21,7 +18,8 @@ from distrace.checkpoints.model import Model
 from distrace.fields.base import SDF, Counted
 from distrace.fields.primitives import box, sphere
 from distrace.rays import meet_sphere
-from distrace.render import Buffers, render
+from distrace.render import Buffers
+from experiments.costs.dist_gradient import attach_dist, march
 
 QUERIES = (1, 3, 5)  # of DIST's gradient
 RADIUS = 0.5  # of the sphere
@@ -45,19 +43,6 @@ class RatioRow:
     ratio_high: float  # its ninetieth
     pixels: int
     left_out: int  # kinks, and rays on which DIST's march ends without a hit
-
-
-@dataclass(frozen=True)
-class Timing:
-    """The time of a depth image and of its gradient. Medians, of runs in turn."""
-
-    parameter: str
-    pixels: int
-    visible: int
-    forward: float  # seconds
-    backward: float
-    ratio: float
-    runs: int
 
 
 @dataclass(frozen=True)
@@ -143,39 +128,3 @@ def _ratio_row(names: tuple[str, str, str], error: Float[Tensor, "n"], ratio: Fl
         pixels=int((~left_out).sum()),
         left_out=int(left_out.sum()),
     )
-
-
-def timings(model: Model, code: int, camera: Camera, repeats: int) -> list[Timing]:
-    """Times a depth image of the default tracer and its backward pass, by code and by camera, after a warm-up run."""
-    runs: dict[str, list[tuple[float, float, int]]] = {"code": [], "camera": []}
-    for _ in range(repeats + 1):
-        runs["code"].append(_timed(model.field(model.codes[code].detach().clone().requires_grad_()), camera))
-        runs["camera"].append(_timed(model.field(code), _attached(camera)))
-    return [_timing(name, camera, times[1:] or times) for name, times in runs.items()]
-
-
-def _timing(name: str, camera: Camera, times: list[tuple[float, float, int]]) -> Timing:
-    forward, backward, visible = zip(*times)
-    before = median(forward)
-    after = median(backward)
-    return Timing(name, camera.height * camera.width, visible[0], before, after, after / before, len(times))
-
-
-def _attached(camera: Camera) -> Camera:
-    """Returns a copy whose intrinsics and pose require gradients."""
-    intrinsics = camera.intrinsics.detach().clone().requires_grad_()
-    return replace(
-        camera, intrinsics=intrinsics, T_world_camera=camera.T_world_camera.detach().clone().requires_grad_()
-    )
-
-
-def _timed(sdf: SDF, camera: Camera) -> tuple[float, float, int]:
-    """Returns the seconds of tracing, the seconds from there to the gradient, and the number of visible pixels."""
-    start = time.perf_counter()
-    buffers = render(sdf, camera)
-    visible = int(buffers.mask.sum())
-    traced = time.perf_counter()
-    buffers.depth[buffers.mask].sum().backward()
-    if camera.intrinsics.is_cuda:
-        torch.cuda.synchronize()
-    return traced - start, time.perf_counter() - traced, visible
