@@ -3,12 +3,14 @@
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from distrace.camera import Camera
 from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.files import written
 from distrace.optional import require
 from distrace.render import Buffers, Config, render
@@ -31,7 +33,7 @@ def turntable(camera: Camera, frames: int) -> list[Camera]:
 
 
 def filmed(
-    sdf: SDF, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
+    sdf: SDF | BatchField[Any], cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
 ) -> Iterator[Buffers]:
     """Renders a field as each camera sees it. All use the occupancy that the first image measures.
 
