@@ -25,7 +25,6 @@ QUERIES = (1, 3, 5)  # of DIST's gradient
 RADIUS = 0.5  # of the sphere
 HALF = (0.5, 0.3, 0.3)  # sizes of the box
 COUNT = 9 * (1 + len(QUERIES))  # of rows
-SIZE = 64  # pixels along each side
 SHARE = 0.1  # of the median derivative: pixels with a smaller one have no ratio
 
 
