@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
+from typing import Any
 
 import numpy as np
 import torch
@@ -88,7 +89,7 @@ def measure_view(
 
     The folder `references` keeps reference depths between runs. Raises `ValueError` for a file there that is none.
     """
-    options = {} if config is None else {"config": config}
+    options: dict[str, Any] = {} if config is None else {"config": config}
     buffers, seconds = timed(lambda: render(view.sdf, view.camera(), **options))
     truth, reference_seconds = _reference(view, references)
     return Measured(_row(view, strategy, buffers, truth, seconds, reference_seconds), view, buffers, truth)
