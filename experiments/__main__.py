@@ -2,7 +2,7 @@
 
 from distrace.cli import run_commands
 from experiments.commands.clip import Clip
-from experiments.commands.costs import Fields, Growth, Memory, Solvers
+from experiments.commands.costs import Fields, Gradients, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
 from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
@@ -15,6 +15,7 @@ from experiments.commands.views import Views
 COMMANDS = {
     "views": Views,
     "fields": Fields,
+    "gradients": Gradients,
     "growth": Growth,
     "memory": Memory,
     "solvers": Solvers,

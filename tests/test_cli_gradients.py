@@ -11,7 +11,6 @@ import torch
 
 import distrace.cli
 import distrace.cli.gradients
-from distrace.benchmarks.derivatives import COUNT
 from distrace.checking.gradcheck import GradientCheck, GradientRow, check_gradients
 from distrace.checkpoints.model import save_experiment
 from experiments.fields.untrained import ball
@@ -134,15 +133,15 @@ def test_bench_gradients_writes_a_table_times_and_a_page(model: Path, run: Calla
     assert run("bench", "gradients", model, "--size", 24, "--repeats", 1, "--out", tmp_path) == 0
     assert {path.name for path in tmp_path.iterdir()} == {"result.json", "index.html"}
     content = facts(tmp_path)
-    assert len(content["rows"]) == COUNT
-    assert {"field", "parameter", "method", "relative_error", "ratio", "pixels", "model"} <= set(content["rows"][0])
-    exact = [row for row in content["rows"] if row["method"] == "exact"]
-    assert len(exact) == COUNT / 4
-    assert all(row["relative_error"] < 1e-5 for row in exact)
+    keys = {"model", "field", "quantity", "parameter", "method", "relative_error", "worst", "pixels", "verdict"}
+    assert all(keys <= set(row) for row in content["rows"])
+    by_code = {row["quantity"]: row for row in content["rows"] if row["parameter"] == "code"}
+    assert by_code["depth"]["relative_error"] < 1e-5
+    assert by_code["depth"]["pixels"] > 20
     assert {row["parameter"] for row in content["timing"]} == {"code", "camera"}
     for row in content["timing"]:
         assert row["ratio"] == pytest.approx(row["backward"] / row["forward"])
         assert row["visible"] > 20
     text = (tmp_path / "index.html").read_text(encoding="utf-8")
-    assert text.count("<img") == COUNT / 4
-    assert "decoder by weights: exact, DIST, k = 1" in text
+    assert "How long does a backward pass take?" in text
+    assert "focal length" in text

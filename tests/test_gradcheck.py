@@ -8,10 +8,9 @@ from torch import Tensor, nn
 
 from distrace.camera import Camera
 from distrace.checking.differences import derivatives, differences
-from distrace.checking.footprints import STEP_OF_VIEW, Footprints
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, check_gradients, compare
 from distrace.checking.moves import all_moves, decoder_changes, in_double, own_changes
-from distrace.checking.retrace import DOUBLE, SINGLE, Retraced, minimum_near, root_near
+from distrace.checking.retrace import DOUBLE, SINGLE, STEP_OF_VIEW, Footprints, Retraced, minimum_near, root_near
 from distrace.checkpoints.model import load_model
 from distrace.fields import primitives
 from distrace.fields.decoder import Decoder, NetworkSpecs

@@ -8,16 +8,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace.benchmarks.derivatives import COUNT, QUERIES, RatioRow, ratio_rows, subjects
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives
 from distrace.checking.gradcheck import check_gradients
 from distrace.checking.moves import Move, all_moves
 from distrace.checking.retrace import DOUBLE, Retraced
-from distrace.checkpoints.model import Model
 from distrace.fields import primitives
 from distrace.fields.base import SDF
-from experiments.fields.untrained import ball
 
 f64 = torch.float64
 RADIUS, CENTRE = 0.5, torch.tensor([0.1, -0.05, 0.2], dtype=f64)
@@ -171,47 +168,6 @@ def test_a_longer_lens_and_a_shifted_sensor_are_relative_to_their_size() -> None
     _, shifted = moves["principal point"]["y"](h)
     assert (shifted.intrinsics - before)[1, 2] == 12
     assert (shifted.intrinsics - before).count_nonzero() == 1
-
-
-@pytest.fixture(scope="module")
-def ratios() -> dict[tuple[str, str, str], tuple[RatioRow, Tensor]]:
-    model = Model("ball", ball(3, 32).decoder, torch.zeros(1, 1), ("ball",))
-    rows = [line for subject in subjects(model, 0, 32) for line in ratio_rows(subject)]
-    return {(row.field, row.parameter, row.method): (row, image) for row, image in rows}
-
-
-def test_the_exact_derivative_has_the_ratio_one_and_dists_has_not(ratios) -> None:
-    for (_, _, method), (row, image) in ratios.items():
-        assert row.pixels > 20
-        if method == "exact":
-            assert row.relative_error < 1e-6, row
-            assert row.worst < 1e-3, row
-            assert (image[~image.isnan()] - 1).abs().max() < 1e-2
-        else:
-            assert row.relative_error > 0.05, row
-    assert len(ratios) == COUNT
-    assert {method for _, _, method in ratios} == {"exact", *(f"DIST, k = {k}" for k in QUERIES)}
-
-
-def test_on_the_sphere_dists_ratio_is_that_of_the_papers_own_code(ratios) -> None:
-    for k, facing, grazing in ((1, 1.5, 0.85), (3, 4.5, 2.56), (5, 7.5, 3.42)):
-        _, image = ratios["sphere", "radius", f"DIST, k = {k}"]
-        assert image[15:17, 15:17].mean() == pytest.approx(facing, rel=0.02)
-        assert image[~image.isnan()].min() < grazing
-
-
-def test_a_face_at_a_grazing_angle_is_among_the_boxs_pixels(ratios) -> None:
-    row, image = ratios["box", "size", "DIST, k = 1"]
-    assert image[~image.isnan()].min() < 0.3
-    assert row.ratio_high > 1.4
-
-
-def test_a_subject_counts_what_it_asked_for() -> None:
-    model = Model("ball", ball(1, 8).decoder, torch.zeros(1, 1), ("ball",))
-    sphere_subject, *_ = subjects(model, 0, 16)
-    assert sphere_subject.tally.evaluations == 0
-    list(ratio_rows(sphere_subject))
-    assert sphere_subject.tally.evaluations > 1000
 
 
 def test_rays_of_a_moved_camera_are_those_that_are_compared() -> None:

@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -149,9 +150,12 @@ def test_an_interrupted_movie_leaves_the_one_before_as_it_was(
             raise KeyboardInterrupt
         return original(*arguments, **options)
 
-    owner, part = (movie, "_encodable") if name == "mp4" else (Image.Image, "crop")
-    original = getattr(owner, part)
-    monkeypatch.setattr(owner, part, interrupted)
+    if name == "mp4":
+        original = av.VideoFrame.from_ndarray
+        monkeypatch.setattr(av, "VideoFrame", SimpleNamespace(from_ndarray=interrupted))
+    else:
+        original = Image.Image.crop
+        monkeypatch.setattr(Image.Image, "crop", interrupted)
     with pytest.raises(KeyboardInterrupt):
         SAVERS[name](path, pictures(16, 16, frames=4))
     assert path.read_bytes() == before

@@ -1,6 +1,4 @@
-"""Rays, and where they meet the sphere that bounds a field, or a box."""
-
-import math
+"""Rays, and where they meet the sphere that bounds a field."""
 
 import pytest
 import torch
@@ -8,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch.nn.functional import normalize
 
-from distrace.rays import Bounds, Rays, meet_box, meet_sphere
+from distrace.rays import Bounds, Rays, meet_sphere
 
 
 def random_rays(seed: int, count: int = 200, spread: float = 2.0) -> Rays:
@@ -83,66 +81,3 @@ def test_rays_are_indexed_flattened_and_detached_as_their_tensors_are() -> None:
 
 def test_bounds_without_length_meet_nothing() -> None:
     assert Bounds(torch.tensor([1.0, 1.0, 2.0]), torch.tensor([2.0, 1.0, 1.0])).meets.tolist() == [True, False, False]
-
-
-LOW, HIGH = torch.tensor([-0.5, -0.2, 0.1], dtype=torch.float64), torch.tensor([0.4, 0.3, 0.9], dtype=torch.float64)
-
-
-def slow_box(origin: list[float], direction: list[float]) -> tuple[float, float]:
-    """Side by side, in plain Python; an empty stretch where the ray misses."""
-    near, far = 0.0, math.inf
-    for o, v, low, high in zip(origin, direction, LOW.tolist(), HIGH.tolist()):
-        if v == 0:
-            near, far = (near, far) if low <= o <= high else (math.inf, -math.inf)
-        else:
-            ends = sorted([(low - o) / v, (high - o) / v])
-            near, far = max(near, ends[0]), min(far, ends[1])
-    return (near, far) if near < far else (math.inf, -math.inf)
-
-
-def assert_as_slow(rays: Rays) -> Bounds:
-    bounds = meet_box(rays, LOW, HIGH)
-    expected = [slow_box(o, v) for o, v in zip(rays.origins.tolist(), rays.directions.tolist())]
-    true = torch.tensor(expected, dtype=torch.float64)
-    torch.testing.assert_close(torch.stack([bounds.near, bounds.far], dim=-1), true)
-    return bounds
-
-
-@given(seed=st.integers(0, 10**6), spread=st.floats(0.1, 2))
-def test_a_ray_meets_a_box_as_it_meets_its_sides_one_by_one(seed: int, spread: float) -> None:
-    bounds = assert_as_slow(random_rays(seed, spread=spread))
-    assert (bounds.near >= 0).all()
-    assert not bounds.meets.all()
-
-
-@given(seed=st.integers(0, 10**6), parallel=st.integers(1, 2), negative=st.booleans())
-def test_rays_along_the_sides_of_a_box_meet_it_too(seed: int, parallel: int, negative: bool) -> None:
-    """Directions with zeros of either sign, origins inside and outside."""
-    rays = random_rays(seed, spread=0.5)
-    directions = rays.directions.clone()
-    directions[:, :parallel] = -0.0 if negative else 0.0
-    bounds = assert_as_slow(Rays(rays.origins, normalize(directions, dim=-1)))
-    assert bounds.meets.any()
-    assert not bounds.meets.all()
-
-
-@given(seed=st.integers(0, 10**6))
-def test_from_within_a_box_a_ray_begins_at_once_and_leaves_through_a_side(seed: int) -> None:
-    inside = LOW + (HIGH - LOW) * torch.rand(100, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-    rays = Rays(inside, random_rays(seed, 100).directions)
-    bounds = meet_box(rays, LOW, HIGH)
-    assert (bounds.near == 0).all()
-    assert bounds.meets.all()
-    end = rays.at(bounds.far)
-    assert torch.minimum((end - LOW).abs(), (end - HIGH).abs()).amin(-1).max() < 1e-9
-    assert ((end > LOW - 1e-9) & (end < HIGH + 1e-9)).all()
-
-
-def test_a_box_behind_a_ray_is_not_met() -> None:
-    bounds = meet_box(ray([0, 0, 2], [0, 0, 1]), LOW, HIGH)
-    assert (bounds.near.item(), bounds.far.item()) == (math.inf, -math.inf)
-
-
-def test_a_ray_in_the_plane_of_a_side_gives_numbers() -> None:
-    bounds = meet_box(ray([-0.5, 0, 2], [0, 0, -1]), LOW, HIGH)
-    assert (bounds.near.item(), bounds.far.item()) == pytest.approx((1.1, 1.9))

@@ -28,6 +28,7 @@ from distrace.data.photographs import Photographs, Placement, save_photographs
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fields.primitives import box, sphere, torus
 from distrace.photos.visual_hull import mask_overlaps, visual_hull
+from distrace.pose import exp_se3
 from distrace.rays import Rays, meet_sphere
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
 from distrace.reconstruction.losses import MARCH, PixelSampler, loss_terms, surface_colours
@@ -35,7 +36,6 @@ from distrace.reconstruction.matching import PatchMatching
 from distrace.reconstruction.multiview_depth import NO_DEPTHS
 from distrace.reconstruction.networks import (
     ColourNetwork,
-    CountedSurface,
     GridSpecs,
     HashGrid,
     SurfaceNetwork,
@@ -48,7 +48,6 @@ from distrace.reconstruction.state import (
     Reconstruction,
     fingerprint,
     load_reconstruction,
-    rigid_motions,
     save_reconstruction,
 )
 from distrace.render import render
@@ -187,7 +186,7 @@ def test_without_a_surface_there_is_no_colour_refinement(views: list[Photograph]
 
 def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]) -> None:
     steps = torch.tensor([[0.0, 0.0, math.pi / 2, 0.0, 0.0, 0.5], [0.0] * 6])
-    turned, still = rigid_motions(steps)
+    turned, still = exp_se3(steps[:, :3], steps[:, 3:])
     assert torch.allclose(turned @ torch.tensor([1.0, 0.0, 0.0, 1.0]), torch.tensor([0.0, 1.0, 0.5, 1.0]), atol=1e-6)
     assert torch.equal(still, torch.eye(4))
     assert pixel_shift(views[0], moved(views[0], still)) == 0.0
@@ -196,8 +195,8 @@ def test_motions_turn_shift_and_leave_the_whole_in_place(views: list[Photograph]
     assert torch.equal(state.motions(), torch.eye(4).expand(2, 4, 4)), "all cameras moved alike would move the object"
     nudge = torch.tensor([[0.0, 0.0, 0.0, 0.03, 0.0, 0.0]])
     pool = PixelSampler.of(views[:1]).pixels
-    there = PixelSampler.of([moved(views[0], rigid_motions(nudge)[0])]).pixels
-    again = pool.moved(rigid_motions(nudge))
+    there = PixelSampler.of([moved(views[0], exp_se3(nudge[0, :3], nudge[0, 3:]))]).pixels
+    again = pool.moved(exp_se3(nudge[:, :3], nudge[:, 3:]))
     assert torch.allclose(again.rays.origins[0], there.rays.origins[0], atol=1e-6)
     assert torch.allclose(again.rays.directions.mean(0), there.rays.directions.mean(0), atol=1e-2)
 
@@ -213,7 +212,7 @@ def test_a_camera_between_two_moves_as_they_do() -> None:
 
 @pytest.mark.slow
 def test_a_disturbed_camera_is_registered(views: list[Photograph], fitted: Reconstruction) -> None:
-    off = moved(views[0], rigid_motions(torch.tensor([[0.05, -0.04, 0.03, 0.05, 0.0, -0.08]]))[0])
+    off = moved(views[0], exp_se3(torch.tensor([0.05, -0.04, 0.03]), torch.tensor([0.05, 0.0, -0.08])))
     found = registered(fitted, off, SHORT)
     assert pixel_shift(views[0], found) < pixel_shift(views[0], off) / 2, (
         pixel_shift(views[0], found),
@@ -325,7 +324,7 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
     small = [view.at_most(32) for view in views]
     some = PixelSampler.of(small).sample(600, random)
     matching = PatchMatching.of(small, CPU)
-    surface = CountedSurface(state.surface)
+    surface = state.surface
     for shapes, pulled in ((False, set[str]()), (True, {"colour", "patches"})):
         terms = loss_terms(some, matching, surface, state.colour, random, shapes, 100.0)
         weights = list(state.surface.parameters())

@@ -6,12 +6,13 @@ from pathlib import Path
 import torch
 import tyro
 
+from distrace.benchmarks.backward import timings
 from distrace.benchmarks.measuring import poster_view
 from distrace.cli.bench import finish, rows_of, show
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.files import save_json, save_text
-from experiments.costs import fields, growth, pages, solvers
+from experiments.costs import fields, gradients, growth, pages, solvers
 from experiments.datasets.splits import on_side
 
 Name = tyro.conf.Positional[ModelName]
@@ -90,6 +91,39 @@ class Memory:
                 bar.advance(f"{size} × {size}: {mib:.0f} MiB")
         show_table(rows)
         run.finish({"rows": rows, **origin()})
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Compare exact derivatives and DIST's with finite differences, on a sphere, a box and a decoder."""
+
+    model: Name = "sofas"
+    out: Path = Path("out/gradients")
+    code: int = 0  # which training shape
+    size: int = 64  # pixels along each side
+    repeats: int = 5  # timed backward passes of a 512 × 512 image, after one to warm up
+    device: str = "cpu"  # of these passes
+
+    def run(self) -> None:
+        run = start(self.out, self.device)
+        model = opened(self.model, run.device)
+        subjects = gradients.subjects(model, self.code, self.size)
+        rows = []
+        ratios = []
+        with progress("gradients", gradients.COUNT) as bar:
+            for subject in subjects:
+                for row, ratio in gradients.ratio_rows(subject):
+                    rows.append(row)
+                    ratios.append(ratio.numpy())
+                    bar.advance(f"{row.field} by {row.parameter}, {row.method}")
+        save_text(run.out / "index.html", pages.gradients_page(rows, ratios))
+        times = timings(model, self.code, poster_view().to(run.device), self.repeats)
+        facts = rows_of(self.model, rows)
+        timing = rows_of(self.model, times)
+        show(facts)
+        show(timing)
+        evaluations = sum(subject.sdf.evaluations for subject in subjects)
+        run.finish({"rows": facts, "timing": timing, **origin(), "evaluations": evaluations})
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from distrace.cli.console import progress, start
 from distrace.data.observation import pictured
 from distrace.data.solid import Solid, normalised
 from distrace.files import written
-from distrace.shading import in_rows, save_png
+from distrace.shading import grid, save_png
 from experiments.procedural import procedural_mesh
 
 PREVIEWED = 32  # shapes
@@ -43,5 +43,5 @@ class Procedural:
                     scaled = normalised(mesh)
                     pictures.append(pictured(Solid(scaled, scaled), poster_view(TILE)))
                 bar.advance(str(number))
-        save_png(run.out / "preview.png", in_rows(pictures, ACROSS))
+        save_png(run.out / "preview.png", grid([pictures[k : k + ACROSS] for k in range(0, len(pictures), ACROSS)]))
         run.finish({"class": self.category, "meshes": self.count, "seed": self.seed})

@@ -14,7 +14,7 @@ from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
-from distrace.movie import turntable
+from distrace.movie import filmed, turntable
 from distrace.render import STRATEGIES, Buffers, render
 from experiments.costs.counting import Operations, recorded
 from experiments.fields.untrained import ball
@@ -90,12 +90,7 @@ def _runs(sdf: SDF | BatchField, cameras: list[Camera], strategies: tuple[str, .
     """Returns a function for each strategy that renders the views; all views reuse the first one's occupancy."""
 
     def run(strategy: str) -> list[Buffers]:
-        views: list[Buffers] = []
-        occupancy = None
-        for camera in cameras:
-            views.append(render(sdf, camera, config=STRATEGIES[strategy], occupancy=occupancy))
-            occupancy = views[-1].occupancy
-        return views
+        return list(filmed(sdf, cameras, config=STRATEGIES[strategy]))
 
     return {strategy: partial(run, strategy) for strategy in strategies}
 

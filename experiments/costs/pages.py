@@ -2,12 +2,20 @@
 
 from collections.abc import Sequence
 
-from distrace.benchmarks.pages import cells
-from distrace.report.charts import courses, growth
-from distrace.report.page import Html, page, section, table
+import numpy as np
+
+from distrace import shading
+from distrace.benchmarks.pages import rows_table
+from distrace.report.page import Html, error_ramp, figure, page, section, table
+from distrace.shading import Picture
+from experiments.charts import courses, growth
 from experiments.costs.fields import FieldRow
+from experiments.costs.gradients import RatioRow
 from experiments.costs.growth import GrowthRow
 from experiments.costs.solvers import Curve, SolverRow
+
+DOUBLINGS = 3.0  # of the ratio, at the strongest colour
+ENLARGED = 4  # × the size of the maps of ratios
 
 
 def fields_page(rows: Sequence[FieldRow]) -> str:
@@ -30,7 +38,7 @@ def growth_page(rows: Sequence[GrowthRow]) -> str:
     for axis in dict.fromkeys(row.axis for row in rows):
         of_axis = [row for row in rows if row.axis == axis]
         charts = _charts(of_axis) if axis != "network" else []
-        parts.append(section(axis.capitalize(), table(*cells(of_axis)), *charts))
+        parts.append(section(axis.capitalize(), rows_table(of_axis), *charts))
     return page(
         "How the cost grows", "The poster's view; 256 × 256 pixels for views and networks, 64 × 64 for shapes.", parts
     )
@@ -48,7 +56,31 @@ def solvers_page(measured: Sequence[tuple[SolverRow, Curve]]) -> str:
     )
     parts = [section(observed, courses(series, "seconds", "loss")) for observed, series in charts.items()]
     rows = [row for row, _ in measured]
-    return page("Adam and Levenberg–Marquardt", lead, [section("Table", table(*cells(rows))), *parts])
+    return page("Adam and Levenberg–Marquardt", lead, [section("Table", rows_table(rows)), *parts])
+
+
+def gradients_page(rows: Sequence[RatioRow], ratios: Sequence[np.ndarray]) -> str:
+    """Returns the page of exact derivatives and DIST's against differences, with maps of their ratio."""
+    maps: dict[str, list[Picture]] = {}
+    for line, ratio in zip(rows, ratios, strict=True):
+        maps.setdefault(f"{line.field} by {line.parameter}", []).append(ratio_map(ratio))
+    methods = ", ".join(dict.fromkeys(line.method for line in rows))
+    pictures = [figure(shading.side_by_side(by_method), f"{name}: {methods}") for name, by_method in maps.items()]
+    scale = error_ramp(f"1 / {2**DOUBLINGS:.0f} or less, or of the wrong sign", f"{2**DOUBLINGS:.0f} times or more")
+    return page(
+        "Gradients",
+        "Derivatives of depth at each pixel against central differences in float64: exact ones, and DIST's.",
+        [
+            section("How large are the errors?", rows_table(rows)),
+            section("Which pixels are off? Ratio of derivative to difference", scale, *pictures),
+        ],
+    )
+
+
+def ratio_map(ratio: np.ndarray) -> Picture:
+    """Returns ratios as colours: grey is right, red too large, blue too small, white has none."""
+    doublings = np.log2(np.where(ratio > 0, ratio, np.where(np.isnan(ratio), np.nan, 2**-DOUBLINGS)))
+    return shading.error_picture(doublings, DOUBLINGS).repeat(ENLARGED, 0).repeat(ENLARGED, 1)
 
 
 def _charts(rows: Sequence[GrowthRow]) -> list[Html]:

@@ -15,7 +15,7 @@ from distrace.data.shapes import Shape
 from distrace.data.solid import solid_of
 from distrace.render import render
 from distrace.report.completion_page import View
-from distrace.shading import Picture, grid, in_rows, side_by_side
+from distrace.shading import Picture, grid, side_by_side
 
 TILE = 128  # pixels
 ACROSS = 8  # pairs in a row
@@ -33,7 +33,7 @@ def pairs_picture(model: Model, shapes: Sequence[Shape], meshes: Path) -> Pictur
             pairs.append(side_by_side([truth, _shaded(model, model.code_of(shape.name))], gap=0))
     blank = np.full_like(pairs[0], 255)
     pairs += [blank] * (-len(pairs) % min(ACROSS, len(pairs)))
-    return in_rows(pairs, ACROSS)
+    return grid([pairs[k : k + ACROSS] for k in range(0, len(pairs), ACROSS)])
 
 
 def walks_picture(model: Model, shapes: Sequence[Shape]) -> Picture:

@@ -16,8 +16,8 @@ from distrace.files import save_json
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
 from distrace.pose import object_in_camera, pose_error, turned_object, with_object_at, zoomed
 from distrace.render import render
-from distrace.report.charts import steps_chart
 from distrace.report.page import page, paragraph, section, short, table
+from experiments.charts import steps_chart
 from experiments.tables.trials import opened_once
 
 SIGMA = "sigma 0.1"  # of each entry of quaternion and translation, as in DIST

@@ -10,8 +10,8 @@ from torch import Tensor
 class ByValue:
     """Makes `==` of a dataclass compare tensors by shape, type, device and values, and its `repr` fit on a line.
 
-    NaN equals NaN. Declare the class by `@dataclass(frozen=True, eq=False, repr=False)`. Equal values have equal
-    hashes, which only know the tensors' shapes. Fields with `compare=False` or `repr=False` are left out.
+    NaN equals NaN. Declare the class by `@dataclass(frozen=True, eq=False, repr=False)`. Fields with `compare=False` or
+    `repr=False` are left out; all instances of a class have one hash.
     """
 
     def __eq__(self, other: object) -> bool:
@@ -21,8 +21,7 @@ class ByValue:
         return all(_same(getattr(self, name), getattr(other, name)) for name in names)
 
     def __hash__(self) -> int:
-        parts = [getattr(self, part.name) for part in _fields(self) if part.compare]
-        return hash((type(self), *map(_hashable, parts)))
+        return hash(type(self))
 
     def __repr__(self) -> str:
         parts = [f"{part.name}={summary(getattr(self, part.name))}" for part in _fields(self) if part.repr]
@@ -49,19 +48,13 @@ def _fields(instance: Any) -> tuple[Field[Any], ...]:
     return fields(instance)
 
 
-def _hashable(value: Any) -> Any:
-    if isinstance(value, Tensor):
-        return value.shape
-    return tuple(map(_hashable, value)) if isinstance(value, tuple | list) else value
-
-
 def _same(first: Any, second: Any) -> bool:
     if first is second:
         return True
     if isinstance(first, tuple | list) and isinstance(second, tuple | list):
         return len(first) == len(second) and all(map(_same, first, second))
-    if not (isinstance(first, Tensor) and isinstance(second, Tensor)):
-        return not isinstance(first, Tensor) and not isinstance(second, Tensor) and bool(first == second)
+    if not isinstance(first, Tensor) or not isinstance(second, Tensor):
+        return not (isinstance(first, Tensor) or isinstance(second, Tensor)) and bool(first == second)
     if (first.shape, first.dtype, first.device) != (second.shape, second.dtype, second.device):
         return False
     with torch.no_grad():

@@ -1,6 +1,5 @@
 """The surface of a field as triangles."""
 
-import math
 import warnings
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -13,6 +12,7 @@ from torch import Tensor
 from distrace.errors import DoubtfulResult
 from distrace.fields.base import SDF, check_field, chunked, evaluate_checked, pruned
 from distrace.fields.lipschitz import percentile_99, typical_slope
+from distrace.surface import directions_of_taps
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,8 +23,7 @@ MAX_ROUNDS = 4  # of meshing again with a larger Lipschitz bound, where the fiel
 SLOPE_TOLERANCE = 1.01  # × the bound: a slope up to here does not exceed it
 SLOPE_MARGIN = 1.25  # × the measured slope: the next round's bound
 LEVELS = 3  # cells are halved this often; only those that can hold the surface are kept
-BALL_SAMPLES = 512  # points on the ball's surface; a field is positive at most of them
-INVERTED = 0.9  # share of them: a field that is negative at more has probably the wrong sign
+INVERTED = 0.9  # share of points on the ball: a field that is negative at more of them has probably the wrong sign
 
 
 @dataclass(frozen=True)
@@ -69,7 +68,7 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> "trimesh.Trimes
 
     check_field(sdf)
     field = _Watched(sdf if hasattr(sdf, "pruned") else chunked(sdf, CHUNK), config.radius)
-    values_on_ball = evaluate_checked(field, _points_on_ball(config))
+    values_on_ball = field(config.radius * directions_of_taps(torch.empty(0, device=config.device)))
     slope, _ = typical_slope(field, torch.empty(0, device=config.device), config.radius)
     if slope > config.steepest:
         config = replace(config, steepest=SLOPE_MARGIN * slope)
@@ -103,32 +102,23 @@ class _Watched:
         values, field = pruned(self.sdf, points)
         return self._counted(points, values), lambda near: self._counted(near, evaluate_checked(field, near))
 
-    def nan(self) -> str:
-        """Returns where the field was NaN, in words; empty where it never was."""
-        points = f"{self.undefined:,} of {self.evaluations:,} points within {self.radius} of the origin"
-        return f"the field is NaN at {points}" if self.undefined else ""
-
     def _counted(self, points: Float[Tensor, "n 3"], values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
         within = points.norm(dim=-1) <= self.radius
         self.evaluations += int(within.sum())
         self.undefined += int((within & values.isnan()).sum())
         return values
 
-
-def _points_on_ball(config: MeshConfig) -> Float[Tensor, "n 3"]:
-    """Returns points spread evenly over the surface of the ball, by the golden angle."""
-    number = torch.arange(BALL_SAMPLES, device=config.device) + 0.5
-    height = 1 - 2 * number / BALL_SAMPLES
-    angle = math.pi * (3 - 5**0.5) * number
-    across = (1 - height**2).sqrt()
-    return config.radius * torch.stack([across * angle.cos(), height, across * angle.sin()], dim=1)
+    def __str__(self) -> str:
+        points = f"{self.undefined:,} of {self.evaluations:,} points within {self.radius} of the origin"
+        return f"the field is NaN at {points}"
 
 
 def _warn_of_doubts(field: _Watched, values_on_ball: Float[Tensor, "n"], config: MeshConfig) -> None:
     if field.undefined:
-        _warn(f"{field.nan()}; the mesh may have holes there")
-    if (negative := int((values_on_ball < 0).sum())) > INVERTED * BALL_SAMPLES:
-        share = f"{negative} of {BALL_SAMPLES} points at {config.radius} from the origin"
+        _warn(f"{field}; the mesh may have holes there")
+    negative = int((values_on_ball < 0).sum())
+    if negative > INVERTED * len(values_on_ball):
+        share = f"{negative} of {len(values_on_ball)} points at {config.radius} from the origin"
         _warn(f"the field is negative at {share}, so the mesh is of what surrounds the shape; is its sign inverted?")
 
 
@@ -144,7 +134,7 @@ def _values(sdf: _Watched, config: MeshConfig) -> np.ndarray:
     values = field(points)
     if not ((values < 0).any() and (values > 0).any()):
         if sdf.undefined:
-            raise ValueError(f"{sdf.nan()}, and has no zero elsewhere: there is no surface to extract")
+            raise ValueError(f"{sdf}, and has no zero elsewhere: there is no surface to extract")
         raise ValueError(
             f"the field has no zero within {config.radius} of the origin: there is no surface to extract; if"
             f" there is, the field is steeper than {config.steepest:.3g} per length: give a larger `steepest`"
@@ -204,13 +194,8 @@ def _offsets(device: torch.device) -> Int[Tensor, "8 3"]:
 
 def _whole_cells(evaluated: np.ndarray) -> np.ndarray:
     """Returns the cells whose eight corners are evaluated, marked at the corner that scikit-image reads."""
-    whole = evaluated.copy()
+    whole = evaluated
     for axis in range(3):
-        shifted = np.zeros_like(whole)
-        inner = [slice(None)] * 3
-        inner[axis] = slice(1, None)
-        before = [slice(None)] * 3
-        before[axis] = slice(None, -1)
-        shifted[tuple(inner)] = whole[tuple(inner)] & whole[tuple(before)]
-        whole = shifted
-    return whole
+        layers = np.moveaxis(whole, axis, 0)
+        whole = np.moveaxis(layers[1:] & layers[:-1], 0, axis)
+    return np.pad(whole, ((1, 0),) * 3)

@@ -3,21 +3,18 @@
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
 from distrace.camera import Camera
 from distrace.fields.base import SDF
+from distrace.fields.batch import BatchField
 from distrace.files import written
 from distrace.optional import require
 from distrace.render import Buffers, Config, render
-from distrace.shading import Picture
 from distrace.tracing.tracer import TracerConfig
-
-if TYPE_CHECKING:
-    import av
 
 Pictures = UInt8[np.ndarray, "frames height width 3"]
 
@@ -36,7 +33,7 @@ def turntable(camera: Camera, frames: int) -> list[Camera]:
 
 
 def filmed(
-    sdf: SDF, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
+    sdf: SDF | BatchField[Any], cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
 ) -> Iterator[Buffers]:
     """Renders a field as each camera sees it. All use the occupancy that the first image measures.
 
@@ -56,18 +53,23 @@ def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
     """
     require("a movie", "av")
     import av
-    from av.video.reformatter import ColorRange
+    from av.video.reformatter import ColorRange, Colorspace
 
-    _, height, width, _ = _some(pictures).shape
+    _, height, width, _ = _not_empty(pictures).shape
     even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
     with written(path) as file:  # by its name: to bring the index to the front, the file is read again
         with av.open(file.name, "w", format="mp4", options={"movflags": "faststart"}) as movie:
             stream = movie.add_stream("libx264", rate=1 / frame, options={"crf": "18"})
             stream.height, stream.width = even.shape[1:3]
-            stream.pix_fmt, stream.color_range = "yuv420p", ColorRange.MPEG
+            stream.pix_fmt = "yuv420p"
+            stream.color_range = ColorRange.MPEG
             stream.colorspace = stream.color_primaries = stream.color_trc = BT709
             for picture in even:
-                movie.mux(stream.encode(_encodable(picture)))
+                image = av.VideoFrame.from_ndarray(picture, format="rgb24")
+                image = image.reformat(  # to the colours that the stream says it has: players would guess otherwise
+                    format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG
+                )
+                movie.mux(stream.encode(image))
             movie.mux(stream.encode())
 
 
@@ -78,7 +80,7 @@ def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
     """
     from PIL import Image
 
-    _, _, width, _ = _some(pictures).shape
+    _, _, width, _ = _not_empty(pictures).shape
     palette = Image.fromarray(pictures.reshape(-1, width, 3)).quantize()
     images = [Image.fromarray(picture) for picture in pictures]
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
@@ -86,16 +88,7 @@ def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
         first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 * frame), loop=0)
 
 
-def _some(pictures: Pictures) -> Pictures:
+def _not_empty(pictures: Pictures) -> Pictures:
     if not len(pictures):
         raise ValueError("no picture was given; a movie needs at least one")
     return pictures
-
-
-def _encodable(picture: Picture) -> "av.VideoFrame":
-    """In the colours that the stream says it has: who plays it would guess otherwise."""
-    import av
-    from av.video.reformatter import ColorRange, Colorspace
-
-    frame = av.VideoFrame.from_ndarray(picture, format="rgb24")
-    return frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709, dst_color_range=ColorRange.MPEG)

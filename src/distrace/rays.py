@@ -65,12 +65,3 @@ def meet_sphere(rays: Rays, radius: float = 1.0) -> Bounds:
     far = towards + half
     misses = (nearest >= radius**2) | (far <= 0)
     return Bounds(near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf))
-
-
-def meet_box(rays: Rays, low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bounds:
-    """Returns the interval of each ray within a box with sides along the axes, t ≥ 0."""
-    sides = torch.stack([(side - rays.origins) / rays.directions for side in (low, high)])
-    near = sides.amin(0).nan_to_num(-torch.inf, posinf=torch.inf, neginf=-torch.inf).amax(-1).clamp_min(0)
-    far = sides.amax(0).nan_to_num(torch.inf, posinf=torch.inf, neginf=-torch.inf).amin(-1)
-    misses = near >= far
-    return Bounds(near.masked_fill(misses, torch.inf), far.masked_fill(misses, -torch.inf))

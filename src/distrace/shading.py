@@ -27,18 +27,18 @@ CLAY = np.array([0.60, 0.53, 0.46])  # linear light
 def depth_picture(depth: Float[Array, "height width"], near: float | None = None, far: float | None = None) -> Picture:
     """Near is yellow and far is violet, evenly to the eye. Pictures of one range, near to far, can be compared."""
     values = _numpy(depth)
-    seen = np.isfinite(values)
+    finite = np.isfinite(values)
     least, most = depth_range(values)
     near, far = least if near is None else near, most if far is None else far
-    nearness = (far - np.where(seen, values, far)) / max(far - near, 1e-12)
-    return _over_white(_mapped("viridis", nearness), seen)
+    nearness = (far - np.where(finite, values, far)) / max(far - near, 1e-12)
+    return _over_white(_mapped("viridis", nearness), finite)
 
 
 def depth_range(*depths: Float[Array, "..."]) -> tuple[float, float]:
     """The least and the greatest finite depth of several images; 0 and 1 where there is none."""
     values = np.concatenate([_numpy(depth).ravel() for depth in depths])
-    seen = values[np.isfinite(values)]
-    return (float(seen.min()), float(seen.max())) if seen.size else (0.0, 1.0)
+    finite = values[np.isfinite(values)]
+    return (float(finite.min()), float(finite.max())) if finite.size else (0.0, 1.0)
 
 
 def normal_picture(
@@ -60,8 +60,7 @@ def colour_picture(image: Float[Array, "height width 3"]) -> Picture:
 
 
 def mask_picture(mask: Bool[Array, "height width"]) -> Picture:
-    seen = _numpy(mask)
-    return np.where(seen[..., None], INK, WHITE).astype(np.uint8)
+    return np.where(_numpy(mask)[..., None], INK, WHITE).astype(np.uint8)
 
 
 def mask_comparison(observed: Bool[Array, "height width"], rendered: Bool[Array, "height width"]) -> Picture:
@@ -92,8 +91,16 @@ def shaded_picture(
 def error_picture(difference: Float[Array, "height width"], limit: float) -> Picture:
     """A signed difference: blue is -limit, red is +limit, grey is none, white is where there is nothing to compare."""
     values = _numpy(difference)
-    seen = np.isfinite(values)
-    return _over_white(_mapped("coolwarm", np.where(seen, values, 0) / (2 * limit) + 0.5), seen)
+    finite = np.isfinite(values)
+    return _over_white(_mapped("coolwarm", np.where(finite, values, 0) / (2 * limit) + 0.5), finite)
+
+
+def difference(depth: Float[Array, "height width"], truth: Float[Array, "height width"]) -> np.ndarray:
+    """Depth − truth; NaN where one of them is not finite."""
+    first = _numpy(depth)
+    second = _numpy(truth)
+    both = np.isfinite(first) & np.isfinite(second)
+    return np.subtract(first, second, out=np.full_like(first, np.nan), where=both)
 
 
 def dots_picture(
@@ -116,11 +123,6 @@ def dots_picture(
 def side_by_side(pictures: Sequence[Picture], gap: int = 8) -> Picture:
     """Pictures in a row, their upper edges aligned."""
     return grid([pictures], gap)
-
-
-def in_rows(pictures: Sequence[Picture], across: int) -> Picture:
-    """Pictures one after the other, so many in a row."""
-    return grid([pictures[k : k + across] for k in range(0, len(pictures), across)])
 
 
 def grid(rows: Sequence[Sequence[Picture]], gap: int = 8) -> Picture:
@@ -171,9 +173,9 @@ def _unit(vector: np.ndarray) -> np.ndarray:
     return vector / np.linalg.norm(vector)
 
 
-def _over_white(colours: Float[np.ndarray, "height width 3"], seen: Bool[np.ndarray, "height width"]) -> Picture:
-    """Colours from 0 to 1 where something was seen, white elsewhere."""
-    return colour_picture(np.where(seen[..., None], colours, 1))
+def _over_white(colours: Float[np.ndarray, "height width 3"], mask: Bool[np.ndarray, "height width"]) -> Picture:
+    """Colours from 0 to 1 within the mask, white elsewhere."""
+    return colour_picture(np.where(mask[..., None], colours, 1))
 
 
 def _numpy(image: Array) -> np.ndarray:

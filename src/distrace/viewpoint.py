@@ -1,6 +1,5 @@
 """Positions and orientations of cameras, from numbers or from tensors with gradients and batch axes."""
 
-import math
 from collections.abc import Sequence
 from functools import reduce
 
@@ -23,14 +22,19 @@ def orbiting(
     Tensors keep their gradients and are broadcast. `dtype` is by default that of the tensors, of numbers float32.
     Raises `ValueError` for values that are not finite, and for tensors whose shapes do not fit.
     """
-    if isinstance(azimuth, Tensor) or isinstance(elevation, Tensor) or isinstance(distance, Tensor):
-        return _of_tensors(azimuth, elevation, distance, dtype)
-    if not all(map(math.isfinite, (azimuth, elevation, distance))):
-        raise ValueError(_infinite(azimuth, elevation, distance))
-    az = math.radians(azimuth)
-    el = math.radians(elevation)
-    eye = [math.sin(az) * math.cos(el), math.sin(el), math.cos(az) * math.cos(el)]
-    return torch.tensor(eye, dtype=dtype or torch.float32) * distance
+    given = [part for part in (azimuth, elevation, distance) if isinstance(part, Tensor)]
+    dtype = dtype or _precision(given)
+    precise = dtype if given else torch.float64  # numbers are rounded once
+    device = given[0].device if given else None
+    parts = [torch.as_tensor(part, dtype=precise, device=device) for part in (azimuth, elevation, distance)]
+    az, el, away = _broadcast("azimuth, elevation and distance", *parts)
+    if not (az.isfinite() & el.isfinite() & away.isfinite()).all():
+        turn, rise, reach = (part.tolist() for part in parts)
+        raise ValueError(f"an orbit at {turn}°, {rise}°, {reach} was given; all three must be finite")
+    az = torch.deg2rad(az)
+    el = torch.deg2rad(el)
+    unit = torch.stack([az.sin() * el.cos(), el.sin(), az.cos() * el.cos()], dim=-1)
+    return unit.to(dtype) * away.to(dtype)[..., None]
 
 
 def together(eye: Point, target: Point) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch 3"]]:
@@ -56,22 +60,6 @@ def upright(forward: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     return torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1)
 
 
-def _of_tensors(
-    azimuth: Number, elevation: Number, distance: Number, dtype: torch.dtype | None
-) -> Float[Tensor, "*batch 3"]:
-    given = [part for part in (azimuth, elevation, distance) if isinstance(part, Tensor)]
-    dtype = dtype or _precision(given)
-    device = given[0].device
-    parts = [torch.as_tensor(part, dtype=dtype, device=device) for part in (azimuth, elevation, distance)]
-    az, el, away = _broadcast("azimuth, elevation and distance", *parts)
-    if not (az.isfinite() & el.isfinite() & away.isfinite()).all():
-        raise ValueError(_infinite(*(part.tolist() for part in parts)))
-    az = torch.deg2rad(az)
-    el = torch.deg2rad(el)
-    unit = torch.stack([az.sin() * el.cos(), el.sin(), az.cos() * el.cos()], dim=-1)
-    return unit * away[..., None]
-
-
 def _precision(given: Sequence[Tensor]) -> torch.dtype:
     """The widest precision of the tensors; float32 for integers and half precision, in which no camera is exact."""
     precise = reduce(torch.promote_types, (part.dtype for part in given if part.is_floating_point()), torch.float16)
@@ -82,7 +70,3 @@ def _broadcast(subject: str, *parts: Tensor) -> tuple[Tensor, ...]:
     given = " and ".join(str(list(part.shape)) for part in parts)
     with explained(f"{subject} of shapes {given} were given; they must have the same batch axes, or none"):
         return tuple(torch.broadcast_tensors(*parts))
-
-
-def _infinite(azimuth: object, elevation: object, distance: object) -> str:
-    return f"an orbit at {azimuth}°, {elevation}°, {distance} was given; all three must be finite"

@@ -9,7 +9,7 @@ from torch import Tensor
 from distrace.benchmarks.measuring import Case, reference_depth
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.fields.base import SDF
+from distrace.fields.base import SDF, chunked
 from distrace.rays import Bounds, meet_sphere
 from distrace.render import STRATEGIES, Buffers, Config, render
 from distrace.tracing.sphere_tracing import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
@@ -70,10 +70,7 @@ def _original(model: Model, code: Tensor, camera: Camera) -> Buffers:
 
     Each point has its own copy of the code, and each ray one more query at its least |f|, even after a hit.
     """
-
-    def sdf(points: Tensor) -> Tensor:
-        return torch.cat([model.decoder(part, code.expand(len(part), -1)) for part in points.split(ORIGINAL_BATCH)])
-
+    sdf = chunked(lambda points: model.decoder(points, code.expand(len(points), -1)), ORIGINAL_BATCH)
     buffers = render(sdf, camera, config=COARSE_TO_FINE)
     marched = torch.isfinite(buffers.trace.closest)
     sdf(buffers.rays[marched].at(buffers.trace.closest[marched]))

@@ -10,15 +10,16 @@ from dataclasses import dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from statistics import median
-from zipfile import BadZipFile
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from distrace.benchmarks.measuring import OUTLIER, in_turn, reference_depth
+from distrace.benchmarks.measuring import OUTLIER, reference_depth, timed
 from distrace.benchmarks.random_views import Mixture, Shot, View
+from distrace.errors import explained
 from distrace.files import save_arrays
 from distrace.metrics import depth_errors, iou
 from distrace.render import Buffers, Config, render
@@ -88,12 +89,8 @@ def measure_view(
 
     The folder `references` keeps reference depths between runs. Raises `ValueError` for a file there that is none.
     """
-    camera = view.camera()
-
-    def rendered() -> Buffers:
-        return render(view.sdf, camera) if config is None else render(view.sdf, camera, config=config)
-
-    buffers, seconds, _ = in_turn({strategy: rendered}, 1)[strategy]
+    options: dict[str, Any] = {} if config is None else {"config": config}
+    buffers, seconds = timed(lambda: render(view.sdf, view.camera(), **options))
     truth, reference_seconds = _reference(view, references)
     return Measured(_row(view, strategy, buffers, truth, seconds, reference_seconds), view, buffers, truth)
 
@@ -102,13 +99,8 @@ def _reference(view: View, references: Path | None) -> tuple[Float[Tensor, "size
     """Returns the depth by the reference, and its seconds."""
     path = references and references / f"{_digest(view)}.npz"
     if path and path.exists():
-        try:
-            with np.load(path) as content:
-                depth = torch.from_numpy(content["depth"])
-                seconds = float(content["seconds"])
-        except (OSError, ValueError, KeyError, BadZipFile) as error:
-            raise ValueError(f"{path} holds no reference ({error}); delete it to compute it again") from None
-        return depth.to(view.device), seconds
+        with explained(f"{path} holds no reference; delete it to compute it again"), np.load(path) as content:
+            return torch.from_numpy(content["depth"]).to(view.device), float(content["seconds"])
     start = time.perf_counter()
     depth = reference_depth(lambda points: view.sdf(points) / view.lipschitz, view.camera())
     seconds = time.perf_counter() - start

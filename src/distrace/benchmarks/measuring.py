@@ -137,15 +137,16 @@ def in_turn(
         for name, run in runs.items():
             if turn and seconds[name][0] > LONG:
                 continue
-            results[name], duration = _timed(run)
+            results[name], duration = timed(run)
             seconds[name].append(duration)
             report(f"{name}: {duration:.1f} s")
-    timed = {name: durations[1:] or durations for name, durations in seconds.items()}
-    return {name: (results[name], median(durations), len(durations)) for name, durations in timed.items()}
+    counted = {name: durations[1:] or durations for name, durations in seconds.items()}
+    return {name: (results[name], median(durations), len(durations)) for name, durations in counted.items()}
 
 
 @torch.no_grad()
-def _timed(run: Callable[[], Buffers]) -> tuple[Buffers, float]:
+def timed(run: Callable[[], Buffers]) -> tuple[Buffers, float]:
+    """Returns the result of a run, and its seconds."""
     start = time.perf_counter()
     buffers = run()
     if buffers.trace.distance.is_cuda:

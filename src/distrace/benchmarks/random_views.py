@@ -78,11 +78,17 @@ def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> 
     Raises `ValueError` for sizes that no image has.
     """
     random = np.random.default_rng(seed)
+    codes = model.codes
     for number in range(count):
-        code = _mixture(model, random) if number % 3 == 2 else int(random.integers(len(model.codes)))
-        field = model.field(_mixed(model, code) if isinstance(code, Mixture) else code)
-        shot = aimed(draw_shot(random, sizes), field, random, model.codes.device)
-        yield View(model.name, code, field, shot, device=model.codes.device)
+        if number % 3 == 2:
+            first, second = (int(number) for number in random.integers(len(codes), size=2))
+            code = Mixture(first, second, float(random.uniform()))
+            field = model.field(torch.lerp(codes[first], codes[second], code.share))
+        else:
+            code = int(random.integers(len(codes)))
+            field = model.field(code)
+        shot = aimed(draw_shot(random, sizes), field, random, codes.device)
+        yield View(model.name, code, field, shot, device=codes.device)
 
 
 def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
@@ -115,12 +121,3 @@ def aimed(shot: Shot, sdf: SDF, random: np.random.Generator, device: torch.devic
         point = point - step * (0.2 / step.norm().clamp_min(1e-9)).clamp_max(1.0)
     x, y, z = point.clamp(-0.9, 0.9).tolist()
     return replace(shot, target=(x, y, z))
-
-
-def _mixture(model: Model, random: np.random.Generator) -> Mixture:
-    first, second = (int(number) for number in random.integers(len(model.codes), size=2))
-    return Mixture(first, second, float(random.uniform()))
-
-
-def _mixed(model: Model, mixture: Mixture) -> Float[Tensor, "length"]:
-    return torch.lerp(model.codes[mixture.first], model.codes[mixture.second], mixture.share)

@@ -5,15 +5,14 @@ from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checking.differences import Images, derivatives, differences
-from distrace.checking.footprints import Footprints
-from distrace.checking.moves import Change, Move, Tally, all_moves, in_double, own_changes
-from distrace.checking.retrace import DOUBLE, SINGLE, Precision, Retraced
-from distrace.fields.base import SDF
+from distrace.checking.moves import Change, Move, counted_moves, in_double, own_changes
+from distrace.checking.retrace import DOUBLE, SINGLE, Footprints, Precision, Retraced
+from distrace.fields.base import SDF, Counted
 
 STRAY = 0.01  # share of the pixels that may be off: one-sided differences miss some kinks of ReLU networks
 SMALL = 0.1  # × the median derivative: the scale of relative errors is never below it
@@ -115,19 +114,20 @@ def check_gradients(
     camera = camera.detach().resized(min(size / max(camera.height, camera.width), 1.0))
     intrinsics = camera.intrinsics.to(precision.dtype)
     camera = replace(camera, intrinsics=intrinsics, T_world_camera=camera.T_world_camera.to(precision.dtype))
-    tally = Tally()
-    view = Retraced.of(tally.field(field), camera, radius, precision)
-    values = view.retraced(tally.field(field), camera)
-    footprints = Footprints.of(view, tally.field(field), camera)
+    counted = Counted(field)
+    moves = counted_moves(counted, camera, changes)
+    view = Retraced.of(counted, camera, radius, precision)
+    values = view.retraced(counted, camera)
+    footprints = Footprints.of(view, counted, camera)
     rows: list[GradientRow] = []
-    for parameter, components in all_moves(field, camera, changes).items():
-        moves = {along: tally.move(move) for along, move in components.items()}
-        compared = [_compare_view(view, values, along, move) for along, move in moves.items()]
+    for parameter, components in moves.items():
+        compared = [_compare_view(view, values, along, move) for along, move in components.items()]
         for quantity in compared[0]:
-            by_component = [by_quantity[quantity] for by_quantity in compared]
-            rows.append(_row(quantity, parameter, by_component, view.pixels(quantity), precision))
-        rows.append(_footprint_row(footprints, parameter, moves, footprints.step(of_field=parameter in changes)))
-    return GradientCheck(tuple(rows), precision, tally.evaluations)
+            pixels = view.passing if quantity == "clearance" else view.trace.hit
+            rows.append(_row(quantity, parameter, [each[quantity] for each in compared], pixels, precision))
+        step = footprints.step(of_field=parameter in changes)
+        rows.append(_footprint_row(footprints, parameter, components, step))
+    return GradientCheck(tuple(rows), precision, counted.evaluations)
 
 
 def _accepts_double(sdf: SDF, like: Tensor) -> bool:
@@ -165,8 +165,7 @@ def compare(along: str, derivative: Tensor, difference: Tensor, kink: Tensor | N
 def _footprint_row(footprints: Footprints, parameter: str, moves: Mapping[str, Move], step: float) -> GradientRow:
     precision = footprints.view.precision
     compared = [compare(along, *footprints.slopes(move, step), None, precision) for along, move in moves.items()]
-    pixels = footprints.pixels()
-    row = replace(_row("footprint normal", parameter, compared, pixels, precision, ROUGHLY), step=step)
+    row = replace(_row("footprint normal", parameter, compared, footprints.chosen, precision, ROUGHLY), step=step)
     return row if row.verdict == "zero" else replace(row, verdict="agrees" if row.median <= ROUGHLY else "disagrees")
 
 
@@ -174,18 +173,18 @@ def _row(
     quantity: str,
     parameter: str,
     compared: Sequence[Compared],
-    pixels: Tensor,
+    pixels: Bool[Tensor, "height width"],
     precision: Precision,
     tolerance: float | None = None,
 ) -> GradientRow:
-    """Returns the row of a parameter's components. `pixels` are (x, y); the tolerance is the precision's by default."""
+    """Returns the row of a parameter's components, compared at `pixels`; `tolerance` replaces that of the precision."""
     errors = torch.cat([component.error for component in compared])
     valid = ~errors.isnan()
-    off = errors > (precision.tolerance if tolerance is None else tolerance)
+    off = errors > (tolerance or precision.tolerance)
     at = int(errors.nan_to_num(-1.0, posinf=torch.inf).argmax())
-    component, pixel = divmod(at, len(pixels))
+    component, pixel = divmod(at, len(compared[0].error))
     worst = compared[component]
-    x, y = pixels[pixel].tolist()
+    y, x = pixels.nonzero()[pixel].tolist()
     agrees = bool(errors[at].isfinite() and off.sum() <= STRAY * valid.sum())
     return GradientRow(
         quantity,

@@ -12,71 +12,69 @@ from functools import partial
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from distrace.camera import Camera
 from distrace.fields.base import SDF, Counted, chunked, placed
 from distrace.fields.decoder import Decoder, ShapeField
 
-AXES = "xyz"
 Change = Callable[[Tensor], SDF]
 Move = Callable[[Tensor], tuple[SDF, Camera]]
-Moves = Mapping[str, Mapping[str, Move]]  # by parameter, and by its components
-
-
-class Tally:
-    """Counts the evaluations of several fields together."""
-
-    def __init__(self) -> None:
-        self.fields: list[Counted] = []
-
-    @property
-    def evaluations(self) -> int:
-        return sum(counted.evaluations for counted in self.fields)
-
-    def field(self, sdf: SDF) -> Counted:
-        """Returns the field, counted."""
-        self.fields.append(Counted(sdf))
-        return self.fields[-1]
-
-    def move(self, move: Move) -> Move:
-        """Returns the move with its fields counted."""
-
-        def counted(h: Tensor) -> tuple[SDF, Camera]:
-            sdf, camera = move(h)
-            return self.field(sdf), camera
-
-        return counted
+Moves = dict[str, dict[str, Move]]  # by parameter, and by its components
 
 
 def all_moves(sdf: SDF, camera: Camera, changes: Mapping[str, Change]) -> Moves:
-    """Returns the moves of the camera, of the shape's placement, and of the field's own parameters."""
-    of_field = {name: {"": lambda h, change=change: (change(h), camera)} for name, change in changes.items()}
-    return {**camera_moves(sdf, camera), **placements(sdf, camera), **of_field}
+    """Returns the moves of the camera, of the similarity that places the shape, and of the field's own parameters.
 
+    The camera moves along its own axes.
+    """
+    intrinsics = camera.intrinsics
+    pose = camera.T_world_camera
+    rotations, translations = _generators(intrinsics)
+    zoom = torch.diag(intrinsics.diagonal() * intrinsics.new_tensor([1.0, 1.0, 0.0]))
+    shifts = {axis: camera.width * translations[axis][:3, 1:] for axis in "xy"}
+    similarities = {f"rotation {axis}": generator for axis, generator in rotations.items()}
+    similarities |= {f"translation {axis}": generator for axis, generator in translations.items()}
+    similarities["scale"] = torch.diag(intrinsics.new_tensor([1.0, 1.0, 1.0, 0.0]))
 
-def camera_moves(sdf: SDF, camera: Camera) -> Moves:
-    """Returns the moves of the pose along the camera's own axes, of the focal length, and of the principal point."""
-    like = camera.intrinsics
-    pose_moves = {
-        name: {axis: partial(_move_pose, sdf, camera, generator) for axis, generator in generators.items()}
-        for name, generators in (("camera rotation", _rotations(like)), ("camera translation", _translations(like)))
-    }
-    zoom = torch.diag(torch.stack([like[0, 0], like[1, 1], like.new_zeros(())]))
-    shifts = {axis: camera.width * torch.outer(_unit(like, 3, k), _unit(like, 3, 2)) for k, axis in enumerate("xy")}
+    def moved(generator: Tensor) -> Move:
+        return lambda h: (sdf, replace(camera, T_world_camera=pose @ torch.linalg.matrix_exp(h * generator)))
+
+    def refocused(change: Tensor) -> Move:
+        return lambda h: (sdf, replace(camera, intrinsics=intrinsics + h * change))
+
+    def displaced(generator: Tensor) -> Move:
+        return lambda h: (placed(sdf, torch.linalg.matrix_exp(h * generator)), camera)
+
+    def changed(change: Change) -> Move:
+        return lambda h: (change(h), camera)
+
     return {
-        **pose_moves,
-        "focal length": {"": partial(_change_intrinsics, sdf, camera, zoom)},
-        "principal point": {axis: partial(_change_intrinsics, sdf, camera, shift) for axis, shift in shifts.items()},
+        "camera rotation": {axis: moved(generator) for axis, generator in rotations.items()},
+        "camera translation": {axis: moved(generator) for axis, generator in translations.items()},
+        "focal length": {"": refocused(zoom)},
+        "principal point": {axis: refocused(shift) for axis, shift in shifts.items()},
+        "placement": {name: displaced(generator) for name, generator in similarities.items()},
+        **{name: {"": changed(change)} for name, change in changes.items()},
     }
 
 
-def placements(sdf: SDF, camera: Camera) -> Moves:
-    """Returns the moves of the similarity that places the shape in the world."""
-    like = camera.intrinsics
-    generators = {f"rotation {axis}": generator for axis, generator in _rotations(like).items()}
-    generators |= {f"translation {axis}": generator for axis, generator in _translations(like).items()}
-    generators |= {"scale": torch.diag(like.new_tensor([1.0, 1, 1, 0]))}
-    return {"placement": {name: partial(_move_shape, sdf, camera, generator) for name, generator in generators.items()}}
+def counted_moves(sdf: Counted, camera: Camera, changes: Mapping[str, Change]) -> Moves:
+    """Returns the moves of a counted field, whose changed forms count there, too."""
+    return all_moves(sdf, camera, {name: partial(_counted, sdf, change) for name, change in changes.items()})
+
+
+def _counted(sdf: Counted, change: Change, h: Tensor) -> SDF:
+    return sdf.counting(change(h))
+
+
+def _generators(like: Tensor) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+    """Returns the 4 × 4 generators of rotations about the axes, e × ·, and of translations along them."""
+    units = torch.eye(3, dtype=like.dtype, device=like.device)
+    crossed = [torch.linalg.cross(unit.expand(3, 3), units).T for unit in units]
+    rotations = {axis: pad(matrix, (0, 1, 0, 1)) for axis, matrix in zip("xyz", crossed)}
+    translations = {axis: pad(unit[:, None], (3, 0, 0, 1)) for axis, unit in zip("xyz", units)}
+    return rotations, translations
 
 
 def decoder_changes(decoder: Decoder, code: Float[Tensor, "length"]) -> dict[str, Change]:
@@ -113,36 +111,6 @@ def in_double(field: SDF) -> SDF:
     if isinstance(field, ShapeField) and field.code is not None:
         return in_double(field.decoder).field(field.code.detach().double())
     return field
-
-
-def _move_pose(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
-    return sdf, replace(camera, T_world_camera=camera.T_world_camera @ torch.linalg.matrix_exp(h * generator))
-
-
-def _change_intrinsics(sdf: SDF, camera: Camera, change: Tensor, h: Tensor) -> tuple[SDF, Camera]:
-    return sdf, replace(camera, intrinsics=camera.intrinsics + h * change)
-
-
-def _move_shape(sdf: SDF, camera: Camera, generator: Tensor, h: Tensor) -> tuple[SDF, Camera]:
-    return placed(sdf, torch.linalg.matrix_exp(h * generator)), camera
-
-
-def _rotations(like: Tensor) -> dict[str, Tensor]:
-    """Returns the generators of rotations, e × ·."""
-    generators = {}
-    for k, axis in enumerate(AXES):
-        generators[axis] = like.new_zeros(4, 4)
-        generators[axis][(k + 2) % 3, (k + 1) % 3] = 1
-        generators[axis][(k + 1) % 3, (k + 2) % 3] = -1
-    return generators
-
-
-def _translations(like: Tensor) -> dict[str, Tensor]:
-    return {axis: torch.outer(_unit(like, 4, k), _unit(like, 4, 3)) for k, axis in enumerate(AXES)}
-
-
-def _unit(like: Tensor, length: int, k: int) -> Tensor:
-    return torch.eye(length, dtype=like.dtype, device=like.device)[k]
 
 
 def _direction(like: Tensor) -> Tensor:

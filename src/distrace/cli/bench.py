@@ -7,8 +7,10 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from distrace.benchmarks import ablation, derivatives, pages
+from distrace.benchmarks import ablation, pages
+from distrace.benchmarks.backward import timings
 from distrace.benchmarks.measuring import measure, poster_view
+from distrace.checking.gradcheck import check_gradients
 from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.common import default, opened, show_table
@@ -17,6 +19,7 @@ from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 
 HIDDEN = ("model", "share", "runs")  # columns that the terminal does not show
+CHECKED = 48  # pixels along each side, of the image whose derivatives are checked
 SHORT: dict[str, str] = {
     "setup_queries": "set-up",
     "per_pixel": "per px",
@@ -31,8 +34,8 @@ class Bench:
     """Measure the tracer's cost and error against a cautious reference."""
 
     what: tyro.conf.Positional[Literal["trace", "views", "gradients"]]
-    """trace: every strategy on one view; views: the default tracer on random views; gradients: exact and DIST's
-    derivatives against finite differences, and the time of a backward pass"""
+    """trace: every strategy on one view; views: the default tracer on random views; gradients: derivatives against
+    finite differences, and the time of a backward pass"""
     models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]"), tyro.conf.Positional] = ()
     """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, by default all
     bundled models"""
@@ -81,23 +84,29 @@ class Bench:
         finish(run, rows_of(self.model, [row for row, _ in measured]))
 
     def _gradients(self, run: Run, model: Model) -> None:
-        measured = []
-        subjects = derivatives.subjects(model, self.code, min(self.size, derivatives.SIZE))
-        with progress("gradients", derivatives.COUNT) as bar:
-            for subject in subjects:
-                for row, ratio in derivatives.ratio_rows(subject):
-                    measured.append((row, ratio.numpy()))
-                    bar.advance(f"{row.field} by {row.parameter}, {row.method}")
-        rows, ratios = zip(*measured)
-        timings = derivatives.timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
+        found = check_gradients(model.field(self.code), poster_view(min(self.size, CHECKED)).to(run.device))
+        rows = [
+            {
+                "model": self.model,
+                "field": "decoder",
+                "quantity": row.quantity,
+                "parameter": row.parameter,
+                "method": "exact",
+                "relative_error": row.median,
+                "worst": row.worst,
+                "pixels": row.pixels,
+                "left_out": row.left_out,
+                "verdict": row.verdict,
+            }
+            for row in found.rows
+        ]
+        times = timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
         with run.optional("index.html"):
-            save_text(run.out / "index.html", pages.gradients_page(rows, ratios, timings))
-        facts = rows_of(self.model, rows)
-        times = rows_of(self.model, timings)
-        show(facts)
-        show(times)
-        evaluations = sum(subject.tally.evaluations for subject in subjects)
-        run.finish({"rows": facts, "timing": times, **origin(), "evaluations": evaluations})
+            save_text(run.out / "index.html", pages.gradients_page(rows, times))
+        timing = rows_of(self.model, times)
+        show(rows)
+        show(timing)
+        run.finish({"rows": rows, "timing": timing, **origin(), "evaluations": found.evaluations})
 
 
 def rows_of(model: str, measured: Iterable[Any]) -> list[dict[str, Any]]:

@@ -5,14 +5,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from distrace.benchmarks.agreement import Measured, badness, measure_view, summaries
-from distrace.benchmarks.agreement_page import agreement_page, worst_picture
+from distrace.benchmarks.pages import pictures_of, views_page
 from distrace.benchmarks.random_views import View, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, origin, progress
 from distrace.files import save_text
 from distrace.render import STRATEGIES
-from distrace.shading import save_png
+from distrace.shading import grid, save_png
 
 SHOWN = 10  # the worst views on the page
 
@@ -62,9 +62,9 @@ def bench_views(run: Run, plan: Plan) -> None:
             seconds = measured.row.seconds + measured.row.reference_seconds
             bar.advance(f"{view.model}: IoU {measured.row.iou:.4f}, {seconds:.1f} s")
     lines = summaries(rows)
-    save_png(run.out / "worst.png", worst_picture(worst))
+    save_png(run.out / "worst.png", grid([pictures_of(measured) for measured in worst]))
     with run.optional("index.html"):
-        save_text(run.out / "index.html", agreement_page(strategy, plan.seed, lines, rows, worst))
+        save_text(run.out / "index.html", views_page(strategy, plan.seed, lines, rows, worst))
     show_table([asdict(line) for line in lines])
     evaluations = {name: sum(getattr(row, name) for row in rows) for name in ("evaluations", "setup_evaluations")}
     facts = {"strategy": strategy, "seed": plan.seed, "views": plan.views, "sizes": list(plan.sizes)}

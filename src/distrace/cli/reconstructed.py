@@ -17,8 +17,9 @@ from distrace.data.placement import Placement
 from distrace.files import save_text
 from distrace.mesh import MeshConfig
 from distrace.movie import save_gif
+from distrace.pose import exp_se3
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
-from distrace.reconstruction.state import ReconstructConfig, Reconstruction, rigid_motions
+from distrace.reconstruction.state import ReconstructConfig, Reconstruction
 from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
@@ -95,7 +96,7 @@ class Reconstructed:
         steps = self.state.relative_steps.detach().cpu()
         eyes = torch.stack([each.camera.T_world_camera[:3, 3] for each in self.fitted_to])
         step = interpolated_step(steps, eyes, view.camera.T_world_camera[:3, 3])
-        return moved(view, rigid_motions(step[None])[0])
+        return moved(view, exp_se3(step[:3], step[3:]))
 
     def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[Judged]) -> None:
         examples = self._judged(self._refined[:: -(-len(self._refined) // FITTED_SHOWN)])

@@ -20,8 +20,8 @@ from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.render import render
-from distrace.report import scan_page as report
 from distrace.report.completion_page import View
+from distrace.report.scan_page import scan_page
 
 if TYPE_CHECKING:
     import trimesh
@@ -64,7 +64,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
         lines.append(line)
         facts |= distances
     with run.optional("report.html"):
-        content = report.ScanCompletion(
+        content = scan_page(
             verdict=fit.verdict,
             observed=[shading.depth_picture(view.depth) for view in task.scan.views],
             pictures=pictures,
@@ -74,7 +74,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
             place=place,
             facts=_facts(task, fit),
         )
-        save_text(run.out / "report.html", report.scan_page(content))
+        save_text(run.out / "report.html", content)
     run.finish(facts, *lines)
     return fit.verdict
 

@@ -9,9 +9,10 @@ from torch import Tensor
 from torch.nn.functional import cosine_similarity
 
 from distrace.data.photograph import Photograph
+from distrace.pose import exp_se3
 from distrace.reconstruction.losses import PixelSampler, loss_terms
 from distrace.reconstruction.matching import PatchMatching
-from distrace.reconstruction.state import ReconstructConfig, Reconstruction, rigid_motions
+from distrace.reconstruction.state import ReconstructConfig, Reconstruction
 
 STEPS = 100  # of a registration, …
 RAYS = 1024  # … the rays of each, …
@@ -62,9 +63,10 @@ def registered(state: Reconstruction, photograph: Photograph, config: Reconstruc
     for count in range(STEPS):
         optimiser.param_groups[0]["lr"] = LEARNING_RATE * (1 - count / STEPS)
         random = torch.Generator().manual_seed((config.seed << 32) + count)
-        observed = sampler.sample(RAYS, random).to(state.device).moved(rigid_motions(step))
+        observed = sampler.sample(RAYS, random).to(state.device).moved(exp_se3(step[:, :3], step[:, 3:]))
         terms = loss_terms(observed, matching, surface, colour, random, True, SHARPNESS)
         loss = config.colour * terms["colour"] + config.outline * terms["outline"]
         (step.grad,) = torch.autograd.grad(loss, [step])
         optimiser.step()
-    return moved(photograph, rigid_motions(step.detach())[0])
+    step = step.detach()[0]
+    return moved(photograph, exp_se3(step[:3], step[3:]))

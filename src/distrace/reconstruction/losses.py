@@ -16,7 +16,7 @@ from distrace.fields.base import value_and_gradient
 from distrace.fitting.ray_sampling import band
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.reconstruction.matching import PATCH_WIDTH, PatchMatching
-from distrace.reconstruction.networks import ColourNetwork, Surface
+from distrace.reconstruction.networks import ColourNetwork, SurfaceNetwork
 from distrace.surface import attach, minimum
 from distrace.tracing.sphere_tracing import Trace, TraceConfig, sphere_trace
 
@@ -106,7 +106,7 @@ def _rows(flags: Bool[Tensor, "n"]) -> Tensor:
 def loss_terms(
     observed: PixelRays,
     matching: PatchMatching,
-    surface: Surface,
+    surface: SurfaceNetwork,
     colour: ColourNetwork,
     random: torch.Generator,
     shape_from_colour: bool,
@@ -143,7 +143,7 @@ def loss_terms(
 
 
 def normals_and_features(
-    surface: Surface, points: Float[Tensor, "n 3"], differentiable: bool = True
+    surface: SurfaceNetwork, points: Float[Tensor, "n 3"], differentiable: bool = True
 ) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n features"]]:
     """Unit normals and features at points; constants unless `differentiable` and grad mode is on."""
     keep = torch.is_grad_enabled() and differentiable
@@ -156,7 +156,7 @@ def normals_and_features(
 
 
 def surface_colours(
-    surface: Surface, colour: ColourNetwork, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]
+    surface: SurfaceNetwork, colour: ColourNetwork, points: Float[Tensor, "n 3"], directions: Float[Tensor, "n 3"]
 ) -> Float[Tensor, "n 3"]:
     """Colours of points of the surface as rays of these directions see them."""
     normals, features = normals_and_features(surface, points)
@@ -164,7 +164,12 @@ def surface_colours(
 
 
 def _outline_term(
-    observed: PixelRays, bounds: Bounds, trace: Trace, compared: Bool[Tensor, "n"], surface: Surface, sharpness: float
+    observed: PixelRays,
+    bounds: Bounds,
+    trace: Trace,
+    compared: Bool[Tensor, "n"],
+    surface: SurfaceNetwork,
+    sharpness: float,
 ) -> Float[Tensor, ""]:
     """The cross entropy of the compared rays' least values, divided by the number of all rays.
 
@@ -183,7 +188,7 @@ def _outline_term(
     return entropy / sharpness / len(compared)
 
 
-def _eikonal_term(hits: Float[Tensor, "n 3"], surface: Surface, random: torch.Generator) -> Float[Tensor, ""]:
+def _eikonal_term(hits: Float[Tensor, "n 3"], surface: SurfaceNetwork, random: torch.Generator) -> Float[Tensor, ""]:
     """`eikonal` at points anywhere, and about the surface (Gropp et al., ICML 2020)."""
     anywhere = 2 * torch.rand(max(len(hits), 1), 3, generator=random) - 1
     about = hits + (SHELL * torch.randn(hits.shape, generator=random)).to(hits)

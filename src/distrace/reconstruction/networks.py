@@ -14,8 +14,6 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from distrace.fields.base import Counted
-
 BEND = 2e-4  # of the activation: nearly a ReLU, but with second derivatives
 PRIMES = (1, 2654435761, 805459861)  # of the hash, as Müller et al. have them
 OUTPUT_SCALE = 10.0  # × the entries: each gets few gradients, and learns so much faster than a network's weights
@@ -101,6 +99,7 @@ class SurfaceNetwork(nn.Module):
     """Points → signed distances, and features for the colour network: smooth layers on encoded points."""
 
     input_scale: Tensor  # of each encoded coordinate
+    evaluations: int = 0  # points that it was evaluated at
 
     def __init__(self, specs: SurfaceSpecs = SurfaceSpecs()) -> None:
         super().__init__()
@@ -122,6 +121,7 @@ class SurfaceNetwork(nn.Module):
         return out[..., 0], out[..., 1:]
 
     def _trunk(self, points: Tensor) -> Tensor:
+        self.evaluations += points.numel() // 3
         x = encoded(points, self.specs.frequencies) * self.input_scale
         for layer in self.hidden:
             x = squareplus(layer(x))
@@ -138,21 +138,6 @@ class SurfaceNetwork(nn.Module):
                 layer.weight[:, 3:] = 0.0
         self.last.weight[:1].normal_(math.sqrt(math.pi / self.specs.width), 1e-4)
         self.last.bias[:1] = -self.specs.radius
-
-
-class CountedSurface(Counted):
-    """The same surface, counting evaluated points, with or without features."""
-
-    def __init__(self, surface: SurfaceNetwork) -> None:
-        super().__init__(surface)
-        self.surface = surface
-
-    def features(self, points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch n"]]:
-        self.evaluations += points.numel() // 3
-        return self.surface.features(points)
-
-
-Surface = SurfaceNetwork | CountedSurface
 
 
 class ColourNetwork(nn.Module):

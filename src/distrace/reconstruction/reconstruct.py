@@ -20,7 +20,7 @@ from distrace.rays import meet_sphere
 from distrace.reconstruction.losses import SHELL, PixelSampler, eikonal, loss_terms, normals_and_features
 from distrace.reconstruction.matching import PatchMatching
 from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths, depth_loss, plane_sweep
-from distrace.reconstruction.networks import CountedSurface, Surface
+from distrace.reconstruction.networks import SurfaceNetwork
 from distrace.reconstruction.state import ReconstructConfig, Reconstruction
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 from distrace.training.losses import record
@@ -51,11 +51,12 @@ def informative_depths(photographs: Sequence[Photograph], hull: SDF) -> Consiste
 def initialise(state: Reconstruction, hull: SDF, config: ReconstructConfig, depths: ConsistentDepths) -> None:
     """Fits the surface to the visual hull and then, if there are any, to depths; the rest stays as the hull has it."""
     began = time.perf_counter()
-    surface = CountedSurface(state.surface)
+    surface = state.surface
+    surface.evaluations = 0
     random = torch.Generator().manual_seed(config.seed)
     points = 2 * torch.rand(CANDIDATES, 3, generator=random) - 1
     near = points[hull(points).abs() < SHELL]
-    optimiser = torch.optim.Adam(state.surface.parameters())
+    optimiser = torch.optim.Adam(surface.parameters())
     hull_steps = config.initial_steps // 3 if len(depths) else config.initial_steps
     for step in range(config.initial_steps):
         optimiser.param_groups[0]["lr"] = config.learning_rate * (1 - step / config.initial_steps)
@@ -75,7 +76,7 @@ def initialise(state: Reconstruction, hull: SDF, config: ReconstructConfig, dept
 
 
 def _depths_in_hull(
-    surface: Surface, hull: SDF, points: Float[Tensor, "n 3"], depth_points: Float[Tensor, "m 3"]
+    surface: SurfaceNetwork, hull: SDF, points: Float[Tensor, "n 3"], depth_points: Float[Tensor, "m 3"]
 ) -> Float[Tensor, ""]:
     """The surface's error at depths, and by how much it lies outside the hull."""
     value, gradient = value_and_gradient(surface, torch.cat([points, depth_points]))
@@ -106,7 +107,8 @@ def reconstruct(
             matching = PatchMatching.of(coarse, state.device)
         random = _generator(config, state.step)
         motions = state.motions()
-        surface = CountedSurface(state.surface)
+        surface = state.surface
+        surface.evaluations = 0  # the caller may have rendered it since the last step
         terms = loss_terms(
             sampler.sample(config.rays, random).to(state.device).moved(motions),
             matching.moved(motions),
@@ -134,7 +136,8 @@ def _refine_colours(
     """
     began = time.perf_counter()
     random = _generator(config, config.steps)
-    surface = CountedSurface(state.surface)
+    surface = state.surface
+    surface.evaluations = 0
     pixels = PixelSampler.of([photograph.at_most(config.sizes[-1]) for photograph in photographs]).pixels
     parts = []
     with torch.no_grad():

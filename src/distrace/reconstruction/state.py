@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
-import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -14,6 +13,7 @@ from torch import Tensor
 from distrace.data.photograph import Photograph
 from distrace.errors import explained
 from distrace.files import written
+from distrace.pose import exp_se3
 from distrace.reconstruction.networks import ColourNetwork, SurfaceNetwork, SurfaceSpecs
 
 NAME = "checkpoint.pt"
@@ -88,7 +88,7 @@ class Reconstruction:
 
     surface: SurfaceNetwork
     colour: ColourNetwork
-    camera_steps: Float[Tensor, "views 6"]  # the cameras' motions: see `rigid_motions`
+    camera_steps: Float[Tensor, "views 6"]  # the cameras' motions, as twists
     optimiser: torch.optim.Adam
     step: int = 0
     seconds: float = 0.0  # of all steps
@@ -120,14 +120,8 @@ class Reconstruction:
 
     def motions(self) -> Float[Tensor, "views 4 4"]:
         """The cameras' motions, in the order of the views."""
-        return rigid_motions(self.relative_steps)
-
-
-def rigid_motions(steps: Float[Tensor, "views 6"]) -> Float[Tensor, "views 4 4"]:
-    """Rotations about the world's origin by a rotation vector, in radians, and then translations, in radii."""
-    rotation: Tensor = roma.rotvec_to_rotmat(steps[:, :3])  # pyright: ignore[reportAssignmentType]
-    last = torch.tensor([0.0, 0.0, 0.0, 1.0]).to(steps).expand(len(steps), 1, 4)
-    return torch.cat([torch.cat([rotation, steps[:, 3:, None]], dim=2), last], dim=1)
+        steps = self.relative_steps
+        return exp_se3(steps[:, :3], steps[:, 3:])
 
 
 def fingerprint(photograph: Photograph) -> str:

@@ -8,68 +8,21 @@ import io
 import re
 from collections.abc import Mapping, Sequence
 from html import escape
-from typing import NewType
+from pathlib import Path
+from string import Template
+from typing import TYPE_CHECKING, NewType
 
 import numpy as np
 from jaxtyping import UInt8
 
-from distrace.shading import Colour, Picture
+from distrace.shading import Colour, Picture, error_picture
+
+if TYPE_CHECKING:
+    from distrace.fitting.judge import Verdict
 
 Html = NewType("Html", str)
 
 NUMBER = re.compile(r"–?|[-+−]?[\d.,]+(e[-+]?\d+)?\s?%?")  # an empty cell and a dash count as numbers
-
-STYLE = """
-:root { color-scheme: light dark; --ink: #1c2128; --soft: #616b78; --paper: #fbfbfa; --card: #fff; --line: #e3e5e8; }
-@media (prefers-color-scheme: dark) {
-  :root { --ink: #e4e7eb; --soft: #98a2af; --paper: #15181c; --card: #1d2126; --line: #333a42; }
-}
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink);
-  font: 16px/1.55 Inter, system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", Arial, sans-serif; }
-main { max-width: 1080px; margin: 0 auto; padding: 56px 24px 80px; }
-h1 { font-size: clamp(1.7rem, 4vw, 2.3rem); line-height: 1.15; letter-spacing: -.02em; margin: 0 0 12px; }
-h2 { font-size: 1.2rem; letter-spacing: -.01em; margin: 0 0 6px; }
-p { max-width: 72ch; text-wrap: pretty; margin: 0 0 14px; color: var(--soft); }
-header p { font-size: 1.1rem; margin: 0; }
-section { margin-top: 44px; padding-top: 26px; border-top: 1px solid var(--line); }
-.row { display: grid; gap: 20px; margin: 18px 0; grid-template-columns: repeat(3, 1fr); }
-@media (max-width: 640px) { .row { gap: 12px; grid-template-columns: repeat(2, 1fr); } }
-figure { margin: 0; }
-figure img { display: block; width: 100%; height: auto; background: #fff; border: 1px solid var(--line);
-  border-radius: 10px; }
-figure img.coarse { image-rendering: pixelated; }
-figcaption { margin-top: 8px; font-size: .875rem; line-height: 1.4; color: var(--soft); }
-.scroll { overflow-x: auto; margin: 18px 0; }
-table { border-collapse: collapse; font-size: .94rem; font-variant-numeric: tabular-nums; }
-th, td { text-align: left; vertical-align: top; padding: 8px 28px 8px 0; border-bottom: 1px solid var(--line); }
-th { font-weight: 600; color: var(--soft); font-size: .85rem; white-space: nowrap; }
-.number { text-align: right; white-space: nowrap; }
-.key { display: flex; flex-wrap: wrap; gap: 6px 22px; font-size: .875rem; color: var(--soft); margin: 10px 0; }
-.key i { display: inline-block; width: 12px; height: 12px; border-radius: 3px; margin-right: 8px; }
-.key i.ramp { width: 140px; margin: 0 8px; }
-.chart { max-width: 820px; margin: 18px 0; }
-.chart svg { display: block; width: 100%; height: auto; }
-.chart text { font-family: inherit !important; }
-.banner { margin-top: 28px; padding: 14px 18px; border-radius: 10px; border: 1px solid; font-weight: 600; }
-.banner.trusted { color: #1b5e36; background: #e5f4ea; border-color: #9fd0b1; }
-.banner.doubtful { color: #6b4a00; background: #fff4d6; border-color: #e6c564; }
-.banner.failed { color: #8a1c1c; background: #fde7e7; border-color: #e7a3a3; }
-.scene { height: min(600px, 85vw, 80vh); margin: 18px 0; border: 1px solid var(--line); border-radius: 10px;
-  background: var(--card); overflow: hidden; }
-"""
-
-SHOW_SCENES = """
-const ink = () => getComputedStyle(document.body).color;
-for (const view of document.querySelectorAll(".scene")) {
-  const { data, layout } = JSON.parse(view.previousElementSibling.textContent);
-  layout.font = { color: ink(), family: getComputedStyle(document.body).fontFamily, size: 13 };
-  Plotly.newPlot(view, data, layout, { displaylogo: false, displayModeBar: true, responsive: true, scrollZoom: false,
-    modeBarButtons: [["tableRotation", "pan3d", "zoom3d", "resetCameraDefault3d", "toImage"]] });
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () =>
-    Plotly.relayout(view, { "font.color": ink() }));
-}
-"""
 
 
 def page(title: str, lead: str, sections: Sequence[Html]) -> str:
@@ -79,36 +32,24 @@ def page(title: str, lead: str, sections: Sequence[Html]) -> str:
     if '<div class="scene"' in body:
         from plotly.offline import get_plotlyjs
 
-        scripts = f"<script>{get_plotlyjs()}</script>\n<script>{SHOW_SCENES}</script>"
-    return f"""<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
-  content="default-src 'none'; img-src data: blob:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
-<title>{escape(title)}</title>
-<link rel="icon" href="data:,">
-<style>{STYLE}</style>
-</head>
-<body>
-<main>
-<header><h1>{escape(title)}</h1><p>{escape(lead)}</p></header>
-{body}
-</main>
-{scripts}
-</body>
-</html>
-"""
+        scripts = f"<script>{get_plotlyjs()}</script>\n<script>{resource('scenes.js')}</script>"
+    template = Template(resource("page.html"))
+    return template.substitute(title=escape(title), lead=escape(lead), body=body, scripts=scripts)
+
+
+def resource(name: str) -> str:
+    """Returns a file of this folder."""
+    return Path(__file__).with_name(name).read_text(encoding="utf-8")
 
 
 def section(heading: str, *blocks: Html) -> Html:
     return Html(f"<section><h2>{escape(heading)}</h2>\n" + "\n".join(blocks) + "</section>")
 
 
-def banner(kind: str, text: str) -> Html:
-    """Returns a line that nobody overlooks; `kind` is `trusted`, `doubtful` or `failed`."""
-    return Html(f'<div class="banner {kind}" role="status">{escape(text)}</div>')
+def verdict_banner(verdict: "Verdict") -> Html:
+    """Returns a verdict as a line that nobody overlooks."""
+    text = escape(f"{verdict.name.capitalize()}: {verdict.reason}.")
+    return Html(f'<div class="banner {verdict.name}" role="status">{text}</div>')
 
 
 def paragraph(text: str) -> Html:
@@ -140,6 +81,10 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> Html:
     return Html(f'<div class="scroll"><table>{head}<tbody>{lines}</tbody></table></div>')
 
 
+def facts_section(facts: Mapping[str, str]) -> Html:
+    return section("Facts", table(("", ""), list(facts.items())))
+
+
 def short(value: object) -> str:
     """Returns a value as text: counts with separators, other numbers with five digits.
 
@@ -164,6 +109,11 @@ def ramp(first: str, last: str, colours: UInt8[np.ndarray, "1 n 3"]) -> Html:
     return Html(
         f'<div class="key"><span>{escape(first)}<i class="ramp" style="{style}"></i>{escape(last)}</span></div>'
     )
+
+
+def error_ramp(first: str, last: str, start: float = -1.0) -> Html:
+    """Returns the legend of `shading.error_picture`; `start` is 0 where no difference is negative."""
+    return ramp(first, last, error_picture(np.linspace(start, 1, 64)[None], 1.0))
 
 
 def _line(tag: str, cells: Sequence[str], numeric: Sequence[bool]) -> str:

@@ -10,18 +10,16 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn import functional as F
 
 from distrace.data.photograph import Photograph, averaged
-from distrace.fields.base import value_and_gradient
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import iou
-from distrace.reconstruction.losses import surface_colours
+from distrace.reconstruction.losses import normals_and_features, surface_colours
 from distrace.reconstruction.state import Reconstruction
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
-from distrace.report.page import Html, figure, page, paragraph, section, table
-from distrace.report.scene import scene
+from distrace.report.page import Html, facts_section, figure, page, paragraph, section
+from distrace.report.scene import space_section
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
 from distrace.training.losses import COURSE
 
@@ -49,7 +47,7 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
     Raises `ValueError` for a photograph without a mask.
     """
     view = photograph.at_most(size)
-    buffers, hit, made = seen(state, view)
+    buffers, hit, made = rendered(state, view)
     mask, image = view.known_mask, view.image
     error = (made - image)[mask].square().mean().clamp_min(1e-10)
     pictures = [
@@ -62,7 +60,7 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
 
 
 @torch.no_grad()
-def seen(
+def rendered(
     state: Reconstruction, view: Photograph
 ) -> tuple[Buffers, Bool[Tensor, "height width"], Float[Tensor, "height width 3"]]:
     """Renders the surface as a photograph's camera sees it.
@@ -89,8 +87,8 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh
     vertices = torch.from_numpy(np.asarray(mesh.vertices)).float().to(config.device)
     parts = []
     for points in vertices.split(AT_ONCE):
-        _, gradient = value_and_gradient(state.surface, points)
-        parts.append(surface_colours(state.surface, state.colour, points, -F.normalize(gradient, dim=-1)))
+        normals, features = normals_and_features(state.surface, points)
+        parts.append(state.colour(points, normals, -normals, features))
     colours = (255 * torch.cat(parts)).round().byte().cpu().numpy()
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
@@ -124,9 +122,9 @@ def reconstruction_page(
         [
             *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
             section("Views that were fitted to", *map(_shown, fitted_to)),
-            section("In space", scene({"Surface": mesh}, {})),
+            space_section({"Surface": mesh}),
             section("Loss", curves(course, f"× {COURSE} steps", "mean of a term", True)),
-            section("Facts", table(["", ""], [[key, value] for key, value in facts.items()])),
+            facts_section(facts),
         ],
     )
 

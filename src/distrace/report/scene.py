@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from distrace.optional import require
 from distrace.report.charts import PALETTE
-from distrace.report.page import Html
+from distrace.report.page import Html, paragraph, section
 
 if TYPE_CHECKING:
     import plotly.graph_objects as go
@@ -22,6 +22,12 @@ DIRECTION = (1.4, 0.8, 0.6)  # of the eye, in plotly's axes
 FIELD_OF_VIEW = math.pi / 4  # plotly's, upright
 ASPECT = 1.5  # a little less than pages have
 MARGIN = 1.08
+
+
+def space_section(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray] = {}) -> Html:
+    """Returns the section of a page with `scene`, and how to use it."""
+    usage = "Drag to turn. Buttons switch to moving and zooming; the legend hides and shows."
+    return section("In space", paragraph(usage), scene(meshes, clouds))
 
 
 def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray]) -> Html:

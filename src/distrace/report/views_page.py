@@ -17,7 +17,7 @@ from distrace.render import Buffers, render
 from distrace.report.charts import curves
 from distrace.report.completion_page import View
 from distrace.report.page import figure, page, paragraph, row, section, table
-from distrace.report.scene import scene
+from distrace.report.scene import space_section
 from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def views_page(
         lead,
         [
             section("Views", paragraph("Photographs with the shape's outline, and the shape."), row(*pictures)),
-            section("In space", scene({"Shape": mesh}, {})),
+            space_section({"Shape": mesh}),
             section("Loss", curves(losses, "iteration", "loss", True, last.name)),
             section("Agreement", paragraph(about), table(["view", "colour", ""], cells)),
         ],

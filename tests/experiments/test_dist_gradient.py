@@ -5,10 +5,10 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checking.dist_gradient import attach_dist, march
 from distrace.fields.primitives import sphere
 from distrace.rays import Rays, meet_sphere
 from distrace.tracing.sphere_tracing import AGGRESSIVE, sphere_trace
+from experiments.costs.dist_gradient import attach_dist, march
 
 f64 = torch.float64
 FACING = Rays(torch.tensor([[0.0, 0, 5]], dtype=f64), torch.tensor([[0.0, 0, -1]], dtype=f64))
@@ -70,7 +70,7 @@ def test_a_ray_with_fewer_queries_has_the_gradient_of_those() -> None:
 def test_misses_stay_infinite_and_give_no_gradient() -> None:
     radius = torch.tensor(0.5, dtype=f64, requires_grad=True)
     past = Rays(FACING.origins + torch.tensor([0.9, 0, 0], dtype=f64), FACING.directions)
-    distance = attach_dist(sphere(radius), past, march(sphere(radius), past, meet_sphere(past)))
+    distance = attach_dist(sphere(radius), past, march(sphere(radius), past, meet_sphere(past)), 5)
     assert distance.item() == torch.inf
     assert torch.autograd.grad(distance.sum(), radius)[0] == 0
 

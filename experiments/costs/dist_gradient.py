@@ -8,21 +8,20 @@ from torch import Tensor
 
 from distrace.fields.base import SDF
 from distrace.rays import Bounds, Rays
-from distrace.tracing.sphere_tracing import AGGRESSIVE, TraceConfig
+from distrace.tracing.sphere_tracing import AGGRESSIVE
 
 
 @dataclass(frozen=True)
-class Queries:
+class Marched:
     """The hits of a march, and the distances of its last queries."""
 
     distance: Float[Tensor, "*batch"]  # `inf` without a hit
     last: Float[Tensor, "queries *batch"]  # in the order of the march; NaN where a ray had fewer
-    config: TraceConfig
 
 
 @torch.no_grad()
-def march(sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = AGGRESSIVE, queries: int = 5) -> Queries:
-    """Runs DIST's march t ← t + α · f and keeps the last `queries` distances (DIST's default is 5).
+def march(sdf: SDF, rays: Rays, bounds: Bounds, queries: int = 5) -> Marched:
+    """Runs DIST's march t ← t + α · f, and returns the last `queries` distances (DIST's default is 5).
 
     Raises `ValueError` for fewer than one query.
     """
@@ -34,29 +33,28 @@ def march(sdf: SDF, rays: Rays, bounds: Bounds, config: TraceConfig = AGGRESSIVE
     distance = torch.full_like(t, torch.inf)
     last = torch.full_like(t, torch.nan).repeat(queries, 1)
     active = (t < far).nonzero()[:, 0]
-    for _ in range(config.steps):
+    for _ in range(AGGRESSIVE.steps):
         value = sdf(flat[active].at(t[active]))
         last[:, active] = torch.cat([last[1:, active], t[None, active]])
-        t[active] += _step(value, config)
-        converged = value.abs() < config.tolerance
+        t[active] += _step(value)
+        converged = value.abs() < AGGRESSIVE.tolerance
         distance[active[converged]] = t[active[converged]]
         active = active[~converged & (t[active] < far[active])]
-    return Queries(distance.reshape(rays.shape), last.reshape(queries, *rays.shape), config)
+    return Marched(distance.reshape(rays.shape), last.reshape(queries, *rays.shape))
 
 
-def attach_dist(sdf: SDF, rays: Rays, marched: Queries, queries: int | None = None) -> Float[Tensor, "*batch"]:
+def attach_dist(sdf: SDF, rays: Rays, marched: Marched, queries: int) -> Float[Tensor, "*batch"]:
     """Returns the distances of a march, with the derivative of d = α Σ f(p⁽ⁿ⁾) over the last queries.
 
     The points p⁽ⁿ⁾ are held fixed (Liu et al., CVPR 2020, section 3.3), so the surface's motion counts once per
     query. On a sphere the derivative is off by the factor α · queries · cos θ, where θ is the angle to the normal.
     """
-    hit = marched.distance.isfinite()
-    last = marched.last[-queries:] if queries else marched.last
-    queried = last.isfinite() & hit
+    last = marched.last[-queries:]
+    queried = last.isfinite() & marched.distance.isfinite()
     fixed = Rays(rays.origins.expand(*last.shape, 3)[queried], rays.directions.expand(*last.shape, 3)[queried])
-    steps = _step(sdf(fixed.at(last[queried])), marched.config)
+    steps = _step(sdf(fixed.at(last[queried])))
     return marched.distance + torch.zeros_like(last).masked_scatter(queried, steps - steps.detach()).sum(0)
 
 
-def _step(value: Tensor, config: TraceConfig) -> Tensor:
-    return config.step_scale * value.clamp(-config.step_limit, config.step_limit)
+def _step(value: Tensor) -> Tensor:
+    return AGGRESSIVE.step_scale * value.clamp(-AGGRESSIVE.step_limit, AGGRESSIVE.step_limit)
