@@ -11,10 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from distrace.data.catalogue import Mesh, summary, write_catalogue
-from distrace.data.debian import fetch
-from distrace.data.furniture import PACKAGE, catalogue, left_out, prepare
-from distrace.data.properties import properties
+from distrace.data.debian import Mesh, fetch, summary, write_catalogue
+from distrace.data.furniture import PACKAGE, catalogue, prepare
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 ZERO = {
@@ -92,11 +90,10 @@ def test_the_catalogue_lists_every_obj_with_creator_and_licence(deb, tmp_path):
     assert (tmp_path / "out" / home / "copyright").read_text() == "as they say\n"
 
 
-def test_the_summary_counts_what_is_left_out(deb, tmp_path):
+def test_the_summary_counts_categories_and_licences(deb, tmp_path):
     text = summary(catalogue(deb, tmp_path))
     assert text.startswith("4 meshes (2 other, ")
     assert "3 CC0-1.0" in text
-    assert left_out(tmp_path) == 3
 
 
 def test_a_link_in_place_of_the_table_or_of_what_is_unpacked_is_replaced_not_followed(deb, tmp_path):
@@ -260,31 +257,6 @@ def test_the_licence_is_read_from_the_catalogue(tmp_path, text, licence):
     members = OTHER | {"LICENSE.TXT": text, "PluginFurnitureCatalog.properties": header}
     path = write_deb(tmp_path / "a.deb", {"sweethome3d/furniture/A.sh3f": shelf(members)})
     assert catalogue(path, tmp_path / "out")[0].licence == licence
-
-
-def test_properties_are_read_as_java_reads_them():
-    content = rb"""
-# comment \
-a=1
- ! another
-b : two words
-c three
-d=one, \
-   #two
-e\=f\:g=tab\tend\\
-h=\u20ac \ud83d\ude00
-empty
-""" + "i=Hôi".encode("latin-1")
-    assert properties(content) == {
-        "a": "1",
-        "b": "two words",
-        "c": "three",
-        "d": "one, #two",
-        "e=f:g": "tab\tend\\",
-        "h": "€ 😀",
-        "empty": "",
-        "i": "Hôi",
-    }
 
 
 def fake_apt_get(folder: Path, script: str) -> str:

@@ -10,7 +10,7 @@ import tyro
 from distrace.cli.common import Flag, default
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
-from distrace.data.catalogue import summary
+from distrace.data.debian import summary
 from distrace.data.samples import Doubt
 from distrace.data.shapes import every_mesh, read_split
 from distrace.optional import require
@@ -31,10 +31,7 @@ class Data:
     def run(self) -> None:
         run = start(self.out or Path("out") / self.name)
         meshes = PREPARED[self.name](run.out, self.source)
-        lines = [summary(meshes)]
-        if self.name == "furniture":
-            lines.append(f"{furniture.left_out(run.out)} models in other formats are left out")
-        run.finish({"source": self.name, "meshes": len(meshes)}, *lines)
+        run.finish({"source": self.name, "meshes": len(meshes)}, summary(meshes))
 
 
 @dataclass(frozen=True)
