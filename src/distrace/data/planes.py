@@ -51,7 +51,7 @@ def prepare_parked(out: Path, deb: Path | None = None) -> list[Mesh]:
 
 
 def parked(deb: Path, folder: Path) -> list[Mesh]:
-    """Returns each mesh by its file's name, helicopters, trailers and liveries among them: the split says what is learnt.
+    """Returns each mesh by its file's name, helicopters and liveries among them: the split says what is learnt.
 
     Raises `ValueError` if `deb` is missing, broken, or another package.
     """

@@ -18,9 +18,6 @@ NEAREST = 0.012  # median distance from the origin of samples of a shape in the 
 AWAY = 1.2  # … and at most
 FARTHEST = 4.0  # distance of a sample from such a shape
 
-Batch = tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]
-"""Numbers of shapes, and samples of each: as many outside as inside."""
-
 
 @dataclass(frozen=True)
 class Side:
@@ -57,8 +54,13 @@ class Samples:
     def variant(self) -> Bool[Tensor, "shapes"]:
         return torch.tensor([VARIANT in name for name in self.names])
 
-    def drawn(self, shapes: int, samples: int, variants: float) -> Batch:
-        """A batch of `samples` from `shapes` random shapes; variants are drawn with the weight `variants`."""
+    def drawn(
+        self, shapes: int, samples: int, variants: float
+    ) -> tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]:
+        """Returns the numbers of random shapes, and `samples` of them in all: as many outside as inside.
+
+        Variants are drawn with the weight `variants`, other shapes with 1.
+        """
         chosen = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
         per_side = max(samples // len(chosen) // 2, 1)
         return chosen, torch.cat([side.drawn(chosen, per_side) for side in self.sides], dim=1)
