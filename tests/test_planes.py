@@ -7,8 +7,9 @@ import pytest
 from test_furniture import write_deb
 
 from distrace.data.ac3d import load_ac3d, load_surfaces
+from distrace.data.mesh_files import load_soup
 from distrace.data.planes import catalogue, parked, prepare, prepare_parked
-from distrace.data.solid import load_solid, load_soup
+from distrace.data.solid import load_solid
 
 HEAD = 'AC3Db\nMATERIAL "" rgb 1 1 1  amb 1 1 1  emis 0 0 0  spec 0 0 0  shi 0  trans 0\n'
 TRIANGLE = "SURF 0x10\nmat 0\nrefs 3\n0 0 0\n1 0 0\n2 0 0\n"

@@ -36,7 +36,8 @@ def masked(photographs: Photographs) -> Photographs:
     if all(view.mask is not None for view in views):
         return photographs
     without = [view.name for view in views if view.mask is None]
-    edges = np.concatenate([_edge(view.image.amax(-1).numpy()) for view in views])
+    bright = [view.image.amax(-1).numpy() for view in views]
+    edges = np.concatenate([side for image in bright for side in (image[0], image[-1], image[:, 0], image[:, -1])])
     if np.median(edges) > DARK:
         raise ValueError(
             f"{without[0]} and {len(without) - 1} others have no mask, and their background is not dark: half of the"
@@ -72,14 +73,15 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     dark = colours[bright < threshold_li(bright)]
     mean = dark.mean(0)
     whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
-    apart = _apart(colours, mean, whiten)
+    apart = _deviations(colours, mean, whiten)
     low = threshold_li(apart)
     high = max(threshold_otsu(apart), low)
     smooth = (gaussian(image.numpy(), 1.0, channel_axis=-1) for image in images)
-    return [torch.from_numpy(_stands_out(_apart(image, mean, whiten), low, high)) for image in smooth]
+    return [torch.from_numpy(_stands_out(_deviations(image, mean, whiten), low, high)) for image in smooth]
 
 
-def _apart(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+def _deviations(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+    """Returns Mahalanobis distances from the background's mean colour."""
     return np.linalg.norm((colours - mean) @ whiten.T, axis=-1)
 
 
@@ -103,10 +105,6 @@ def _largest(mask: np.ndarray) -> np.ndarray:
     parts = np.asarray(label(opening(mask, disk(THREAD))))
     largest = parts == (1 + np.bincount(parts.ravel())[1:].argmax() if parts.any() else -1)
     return np.asarray(remove_small_holes(largest, max_size=round(HOLE * parts.size)))
-
-
-def _edge(image: np.ndarray) -> np.ndarray:
-    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
 
 
 def _placed_again(photographs: Photographs) -> Photographs:

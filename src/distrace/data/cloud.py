@@ -12,9 +12,9 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import ALMOST
+from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
-from distrace.data.solid import load_geometry
 from distrace.errors import DoubtfulResult, explained
 
 

@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import check_intrinsics
 from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
-from distrace.data.photo_readers.frames import Shot, Shots, inside
+from distrace.data.photo_readers.frames import Shot, inside
 from distrace.data.photograph import Photograph as Photograph
 from distrace.data.pictures import read_mask, read_picture, save_mask, save_picture
 from distrace.data.placement import Placement as Placement
@@ -48,7 +47,11 @@ def load_photographs(folder: Path) -> Photographs:
 
     Raises `ValueError`, in one sentence that names file and field, for what is missing or makes no sense.
     """
-    shots = _described(folder)
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}")
+    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
+    if shots is None:
+        raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
     if len(shots.views) < 2:
         raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
     names = _distinct([shot.image.stem for shot in shots.views])
@@ -102,15 +105,6 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return list(names) if len(set(names)) == len(names) else [f"{k:03d}_{name}" for k, name in enumerate(names)]
 
 
-def _described(folder: Path) -> Shots:
-    if not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}")
-    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
-    if shots is None:
-        raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
-    return shots
-
-
 def _photograph(shot: Shot) -> Photograph:
     with about(shot.field):
         image, mask = read_picture(shot.image)
@@ -154,18 +148,8 @@ def _remarks(view: Photograph) -> list[str]:
         found.append("has a mask that marks no pixel as object")
     if view.mask is not None and view.mask.all():
         found.append("has a mask that marks every pixel as object")
-    if _place(view).norm() <= 1:
+    if view.camera.T_world_camera[:3, 3].norm() <= 1:
         found.append("was taken from within the unit sphere, where the object is; give a smaller unit_sphere")
-    elif not _sees(view.camera):
+    elif not view.camera.shows(*view.camera.project(view.camera.T_world_camera.new_zeros(3))):
         found.append("does not show the middle of the unit sphere; is its camera right?")
     return found
-
-
-def _place(view: Photograph) -> Float[Tensor, "3"]:
-    return view.camera.T_world_camera[:3, 3]
-
-
-def _sees(camera: Camera) -> bool:
-    pixel, depth = camera.project(camera.T_world_camera.new_zeros(3))
-    size = pixel.new_tensor([camera.width, camera.height])
-    return bool(depth > 0 and (pixel >= 0).all() and (pixel <= size).all())

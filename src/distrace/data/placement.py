@@ -22,15 +22,15 @@ TELL = "tell where the object is as unit_sphere in views.json"
 class Placement:
     """World = centre + radius · unit: centre and radius of the unit sphere, in the units of the folder's world."""
 
-    centre: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]  # in double: worlds may lie far from their origin
     radius: float
 
     def to_world(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        centre = self._centre(points)
+        centre = self.centre.to(points.device)
         return (centre + self.radius * points.to(centre.dtype)).to(points.dtype)
 
     def to_unit(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        centre = self._centre(points)
+        centre = self.centre.to(points.device)
         return ((points.to(centre.dtype) - centre) / self.radius).to(points.dtype)
 
     def camera_to_world(self, camera: Camera) -> Camera:
@@ -43,20 +43,17 @@ class Placement:
         """As `unit_sphere` has it, in views.json and in results."""
         return {"centre": self.centre.tolist(), "radius": self.radius}
 
-    def _centre(self, points: Tensor) -> Tensor:
-        # Worlds may lie far from their origin, so a centre in double is not rounded before it is subtracted.
-        return self.centre.to(points.device)
-
 
 def placement_of(centre: object, radius: object) -> Placement:
     """Raises `ValueError` where they are not three finite numbers and a positive one."""
-    numbers = isinstance(centre, list) and len(centre) == 3 and all(_finite(value) for value in centre)
-    if not numbers or not isinstance(radius, int | float) or not _finite(radius) or not radius > 0:
+    numbers = [*centre, radius] if isinstance(centre, list) else []
+    finite = all(isinstance(value, int | float) and abs(value) <= MOST for value in numbers)
+    if len(numbers) != 4 or not finite or not numbers[3] > 0:
         raise ValueError(
             f"its centre is {centre} and its radius {radius}; three numbers and a positive one are needed, in the units"
             " of T_world_camera"
         )
-    return Placement(torch.tensor(centre, dtype=torch.float64), float(radius))
+    return Placement(torch.tensor(numbers[:3], dtype=torch.float64), float(numbers[3]))
 
 
 def among_points(points: Float[np.ndarray, "points 3"]) -> Placement | None:
@@ -99,10 +96,6 @@ def nearest_to_rays(origins: Float[Tensor, "views 3"], directions: Float[Tensor,
     if ((point - origins) * directions).sum(-1).median() <= 0:
         raise ValueError(f"the views look away from each other: their axes meet behind the cameras; {TELL}")
     return point
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and abs(value) <= MOST
 
 
 def _moved(camera: Camera, place: Float[Tensor, "*batch 3"]) -> Camera:

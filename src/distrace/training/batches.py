@@ -20,25 +20,6 @@ FARTHEST = 4.0  # distance of a sample from such a shape
 
 
 @dataclass(frozen=True)
-class Side:
-    """The samples of all shapes on one side of their surfaces, concatenated so that one gather draws a batch."""
-
-    samples: Float[Tensor, "n 4"]
-    begins: Int[Tensor, "shapes"]
-    counts: Int[Tensor, "shapes"]
-
-    @staticmethod
-    def of(parts: list[Float[Tensor, "_ 4"]]) -> "Side":
-        counts = torch.tensor([len(part) for part in parts])
-        return Side(torch.cat(parts), counts.cumsum(0) - counts, counts)
-
-    def drawn(self, shapes: Int[Tensor, "chosen"], number: int) -> Float[Tensor, "chosen number 4"]:
-        """`number` random samples of each of the shapes."""
-        places = (torch.rand(len(shapes), number, dtype=torch.float64) * self.counts[shapes, None]).long()
-        return self.samples[(self.begins[shapes, None] + places).to(self.samples.device)]
-
-
-@dataclass(frozen=True)
 class Samples:
     """Signed samples of the training shapes: one tensor a shape, of points and distances."""
 
@@ -47,8 +28,10 @@ class Samples:
     inside: list[Float[Tensor, "_ 4"]]
 
     @cached_property
-    def sides(self) -> tuple[Side, Side]:
-        return Side.of(self.outside), Side.of(self.inside)
+    def sides(self) -> list[tuple[Float[Tensor, "_ 4"], Int[Tensor, "shapes"]]]:
+        """Outside and inside: the samples of all shapes, concatenated for a single gather, and their counts."""
+        sides = (self.outside, self.inside)
+        return [(torch.cat(parts), torch.tensor([len(part) for part in parts])) for parts in sides]
 
     @cached_property
     def variant(self) -> Bool[Tensor, "shapes"]:
@@ -63,7 +46,12 @@ class Samples:
         """
         chosen = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
         per_side = max(samples // len(chosen) // 2, 1)
-        return chosen, torch.cat([side.drawn(chosen, per_side) for side in self.sides], dim=1)
+        drawn = []
+        for side, counts in self.sides:
+            begins = counts.cumsum(0) - counts
+            places = (torch.rand(len(chosen), per_side, dtype=torch.float64) * counts[chosen, None]).long()
+            drawn.append(side[(begins[chosen, None] + places).to(side.device)])
+        return chosen, torch.cat(drawn, dim=1)
 
     def to(self, device: torch.device) -> "Samples":
         return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
