@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.checks import ALMOST
+from distrace.data.checks import MAX_MEDIAN_RADIUS
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
@@ -67,7 +67,7 @@ def load_cloud(path: Path) -> Cloud:
         torch.from_numpy(points[usable]).float(), None if normals is None else torch.from_numpy(normals[usable]).float()
     )
     away = cloud.points.norm(dim=-1).median().item()
-    if away > ALMOST or away < ALMOST / 100:
+    if away > MAX_MEDIAN_RADIUS or away < MAX_MEDIAN_RADIUS / 100:
         raise ValueError(
             f"{path}: its points lie {away:.3g} from the origin in the median, but the shape must be in the unit sphere"
             " around the origin: centre it and divide by its largest radius"

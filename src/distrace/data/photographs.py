@@ -27,9 +27,9 @@ LOOKED_FOR = (
     "views.json, transforms.json, transforms_train.json, cameras_sphere.npz, *_par.txt, and COLMAP's cameras.bin or"
     " cameras.txt in sparse/0, sparse and the folder itself"
 )
-BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
-MOST = 20_000  # pixels of a mask that are examined
-GLARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
+MAX_SHARE_BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
+MAX_PIXELS = 20_000  # pixels of a mask that are examined
+MAX_WHITE_SHARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
 
 
 @dataclass(frozen=True)
@@ -88,14 +88,14 @@ def notes(photographs: Photographs) -> list[str]:
     """Sentences about views that can be used but look wrong."""
     found = [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
     beyond = _beyond([view for view in photographs.views if view.mask is not None and view.mask.any()])
-    if beyond > BEYOND:
+    if beyond > MAX_SHARE_BEYOND:
         found.append(f"{beyond:.0%} of the object in the masks lies beyond the unit sphere; give a larger radius")
     return found
 
 
 def _beyond(views: Sequence[Photograph]) -> float:
     """The share of the masks' pixels whose rays miss the unit sphere, in the median of the views."""
-    rays = [view.camera.rays(view.camera.pixels()[thinned(view.known_mask, MOST)]) for view in views]
+    rays = [view.camera.rays(view.camera.pixels()[thinned(view.known_mask, MAX_PIXELS)]) for view in views]
     shares = [meet_sphere(each).near.isinf().double().mean().item() for each in rays]
     return float(np.median(shares)) if shares else 0.0
 
@@ -142,7 +142,7 @@ def _remarks(view: Photograph) -> list[str]:
     found: list[str] = []
     if (view.image == view.image[0, 0]).all():
         found.append("is of one colour all over; is its file whole?")
-    elif (white := (view.image >= 1).all(-1).float().mean()) > GLARE:
+    elif (white := (view.image >= 1).all(-1).float().mean()) > MAX_WHITE_SHARE:
         found.append(f"is fully white at {white:.0%} of its pixels; it is over-exposed, or nothing but background")
     if view.mask is not None and not view.mask.any():
         found.append("has a mask that marks no pixel as object")

@@ -11,9 +11,9 @@ from distrace.errors import explained
 from distrace.files import written
 
 FORMATS = ("PNG", "JPEG")
-PLAIN = ("L", "LA", "RGB", "RGBA")
-GREY = 0.1  # difference between the channels of a grey, at most
-DEEP = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
+EIGHT_BIT = ("L", "LA", "RGB", "RGBA")
+MAX_GREY_DIFFERENCE = 0.1  # difference between the channels of a grey, at most
+SIXTEEN_BIT = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
 
 
 def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"] | None]:
@@ -42,7 +42,7 @@ def read_mask(path: Path) -> Bool[Tensor, "height width"]:
         return alpha
     level = colour.amax(-1)
     brightest = level.max().item()
-    grey = (level - colour.amin(-1)).max() < GREY
+    grey = (level - colour.amin(-1)).max() < MAX_GREY_DIFFERENCE
     if grey and 0 < brightest <= 0.5:
         raise ValueError(
             f"{path} is nowhere brighter than {255 * brightest:.0f} of 255; a mask is white where the object is, and"
@@ -76,8 +76,8 @@ def _levels(path: Path) -> Float[Tensor, "height width channels"]:
 
     with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
-            full = 65535 if file.mode in DEEP else 255
-            if file.mode in (*PLAIN, *DEEP):
+            full = 65535 if file.mode in SIXTEEN_BIT else 255
+            if file.mode in (*EIGHT_BIT, *SIXTEEN_BIT):
                 levels = np.array(file)
             else:
                 levels = np.array(file.convert("RGBA" if file.has_transparency_data else "RGB"))

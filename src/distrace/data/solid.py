@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
 OFFSET = 3e-4  # distance from a face at which its two sides are tested
-SPACING = 0.02  # between the test points of one face
-LEAST_VOLUME = 1e-9  # of a closed part that has an inside
-OPEN = 0.15  # of a part's area: larger holes make it a sheet
+TEST_SPACING = 0.02  # between the test points of one face
+MIN_VOLUME = 1e-9  # of a closed part that has an inside
+MAX_OPEN_SHARE = 0.15  # of a part's area: larger holes make it a sheet
 PURPOSE = "telling a mesh's inside from its outside"  # libigl's winding numbers
 SMALLEST = 0.01  # faces partly inside are split until their edges are this short
 
@@ -120,7 +120,7 @@ def oriented(soup: "trimesh.Trimesh") -> "trimesh.Trimesh":
     if volume.sum() < 0:
         faces = faces[:, ::-1]
         volume = -volume
-    inwards = (closed & (volume < -LEAST_VOLUME))[part]
+    inwards = (closed & (volume < -MIN_VOLUME))[part]
     mesh = trimesh.Trimesh(soup.vertices, faces, process=False)
     if inwards.any():
         outside = mesh.triangles_center[inwards] - OFFSET * mesh.face_normals[inwards]
@@ -151,7 +151,7 @@ def _parts(soup: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray, np.ndarray]
     centre = integral(soup.triangles_center) / area[:, None]
     heights = ((soup.triangles_center - centre[part]) * soup.face_normals).sum(1)
     volume = np.bincount(part, heights * soup.area_faces / 3)
-    return part, volume, np.linalg.norm(integral(soup.face_normals), axis=1) < OPEN * area
+    return part, volume, np.linalg.norm(integral(soup.face_normals), axis=1) < MAX_OPEN_SHARE * area
 
 
 def first_met(
@@ -191,7 +191,7 @@ def _exposure(soup: "trimesh.Trimesh", triangles: np.ndarray) -> tuple[np.ndarra
     """Of each triangle, the share of test points with the solid on one side only, and whether its normal points out."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1)
-    tests = np.clip(np.ceil(doubled_area / 2 / SPACING**2), 3, 500).astype(int)
+    tests = np.clip(np.ceil(doubled_area / 2 / TEST_SPACING**2), 3, 500).astype(int)
     face = np.repeat(np.arange(len(triangles)), tests)
     points = np.einsum("nk,nkd->nd", _spread(tests), triangles[face])
     normals = (cross / doubled_area[:, None])[face]

@@ -14,9 +14,9 @@ from torch import Tensor
 from distrace.checkpoints.model import VARIANT
 from distrace.errors import DoubtfulResult, about, explained
 
-NEAREST = 0.012  # median distance from the origin of samples of a shape in the unit sphere, at least …
-AWAY = 1.2  # … and at most
-FARTHEST = 4.0  # distance of a sample from such a shape
+MIN_MEDIAN_RADIUS = 0.012  # median distance from the origin of samples of a shape in the unit sphere, at least …
+MAX_MEDIAN_RADIUS = 1.2  # … and at most
+MAX_DISTANCE = 4.0  # distance of a sample from such a shape
 
 
 @dataclass(frozen=True)
@@ -106,7 +106,7 @@ def _check_sides(pos: Float[np.ndarray, "_ 4"], neg: Float[np.ndarray, "_ 4"]) -
     samples = np.concatenate([pos, neg])
     away = float(np.median(np.linalg.norm(samples[:, :3], axis=1)))
     farthest = float(np.abs(samples[:, 3]).max())
-    if not NEAREST < away < AWAY or farthest > FARTHEST:
+    if not MIN_MEDIAN_RADIUS < away < MAX_MEDIAN_RADIUS or farthest > MAX_DISTANCE:
         raise ValueError(
             f"its points lie {away:.3g} from the origin in the median, and up to {farthest:.3g} from the surface, but"
             " the shape must be in the unit sphere: divide by its largest radius"

@@ -13,7 +13,7 @@ from distrace.fields.decoder import Decoder
 from distrace.prior import Prior, prior_of
 from distrace.training.batches import Samples
 
-NEAREST = 0.9  # highest correlation with a training code, at which samples constrain the field
+MAX_CORRELATION = 0.9  # highest correlation with a training code, at which samples constrain the field
 REACH = 0.02  # samples this near to one whose sign is wrong are oversampled too, on both sides of the surface
 CERTAIN = 0.002  # signs of samples nearer to the surface are ignored
 
@@ -40,7 +40,7 @@ class Kept:
         """Returns for each shape a random code between its own and a draw of the prior, with the prior's variance."""
         mean = self.prior.mean
         basis = self.prior.basis
-        nearness = NEAREST * torch.rand(len(shapes), 1).to(mean)
+        nearness = MAX_CORRELATION * torch.rand(len(shapes), 1).to(mean)
         draws = torch.randn(len(shapes), basis.shape[1]).to(mean) @ basis.T
         return mean + nearness * (self.codes[shapes.to(mean.device)] - mean) + (1 - nearness.square()).sqrt() * draws
 
