@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from distrace.data.archive import unpack_zip
-from distrace.data.debian import Mesh, by_hand, listed, unpacked
+from distrace.data.debian import Mesh, by_hand, unpacked
 
 PACKAGE = "sweethome3d-furniture"
 CATEGORIES = {
@@ -31,11 +31,6 @@ _LICENCE = re.compile(
 )
 _AUTHORS = (re.compile(r'downloading ".*" by (.+)'), re.compile(r"<title>.* by (.+?) - \d+ - "))
 _HEADER_AUTHOR = re.compile(r"^# 3D models created by ([^,\r\n]+)", re.MULTILINE)
-
-
-def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """Returns every mesh of the package, by `debian.listed`."""
-    return listed(PACKAGE, catalogue, out, deb)
 
 
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:

@@ -7,7 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
-from distrace.data.debian import Mesh, by_hand, listed, unpacked
+from distrace.data.debian import Mesh, by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -20,11 +20,6 @@ PARKED_PACKAGE = "flightgear-data-base"
 PARKED = "usr/share/games/flightgear/Scenery/Models/Aircraft"
 
 _TEXTURE = re.compile(r'^texture\s+"(?:[^"\n]*[/\\])?([^"\n]+)"', re.MULTILINE)
-
-
-def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """Returns one mesh of each aircraft of the package, by `debian.listed`."""
-    return listed(PACKAGE, catalogue, out, deb)
 
 
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:
@@ -43,11 +38,6 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
     return meshes
-
-
-def prepare_parked(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """Returns the meshes of parked aircraft, and of what stands among them, by `debian.listed`."""
-    return listed(PARKED_PACKAGE, parked, out, deb)
 
 
 def parked(deb: Path, folder: Path) -> list[Mesh]:
