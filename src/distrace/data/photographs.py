@@ -43,7 +43,7 @@ class Photographs:
 
 
 def load_photographs(folder: Path) -> Photographs:
-    """The photographs of a folder, in whichever layout it has.
+    """Reads the photographs of a folder, in whichever layout it has.
 
     Raises `ValueError`, in one sentence that names file and field, for what is missing or makes no sense.
     """
@@ -61,19 +61,33 @@ def load_photographs(folder: Path) -> Photographs:
         if len(masks) == len(views) and not any(mask.any() for mask in masks):
             raise ValueError(f"its {len(masks)} masks mark no pixel as object; they are white where the object is")
         placement = shots.placement or estimated(views, shots.points)
-    placed = [replace(view, camera=_single(placement.camera_to_unit(view.camera))) for view in views]
+    placed = []
+    for view in views:
+        camera = placement.camera_to_unit(view.camera)
+        single = replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
+        placed.append(replace(view, camera=single))
     return Photographs(tuple(placed), placement, shots.layout, shots.placement is not None)
 
 
 def save_photographs(folder: Path, photographs: Photographs) -> None:
-    """Our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
+    """Writes our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
+    entries = []
     names = _distinct([view.name for view in photographs.views])
-    entries = [_saved(folder, name, view, photographs.placement) for name, view in zip(names, photographs.views)]
+    for name, view in zip(names, photographs.views):
+        entry: dict[str, object] = {"image": f"images/{name}.png"}
+        save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
+        if view.mask is not None:
+            entry["mask"] = f"masks/{name}.png"
+            save_mask(folder / "masks" / f"{name}.png", view.mask)
+        double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
+        entry["intrinsics"] = view.camera.intrinsics.tolist()
+        entry["T_world_camera"] = photographs.placement.camera_to_world(double).T_world_camera.tolist()
+        entries.append(entry)
     save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.placement.described()})
 
 
 def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> Placement:
-    """From the masks if two views have one, else from points that are known, else from where the cameras look.
+    """Returns the sphere around the masks if two views have one, else around known points, else where cameras look.
 
     Raises `ValueError` where none of these tells.
     """
@@ -85,23 +99,22 @@ def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"]
 
 
 def notes(photographs: Photographs) -> list[str]:
-    """Sentences about views that can be used but look wrong."""
-    found = [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
-    beyond = _beyond([view for view in photographs.views if view.mask is not None and view.mask.any()])
+    """Returns sentences about views that can be used but look wrong."""
+    found = []
+    shares_beyond = []  # of each mask's pixels, those whose rays miss the unit sphere
+    for view in photographs.views:
+        found += [f"{view.name} {remark}" for remark in _remarks(view)]
+        if view.mask is not None and view.mask.any():
+            rays = view.camera.rays(view.camera.pixels()[thinned(view.mask, MAX_PIXELS)])
+            shares_beyond.append(meet_sphere(rays).near.isinf().double().mean().item())
+    beyond = float(np.median(shares_beyond)) if shares_beyond else 0.0
     if beyond > MAX_SHARE_BEYOND:
         found.append(f"{beyond:.0%} of the object in the masks lies beyond the unit sphere; give a larger radius")
     return found
 
 
-def _beyond(views: Sequence[Photograph]) -> float:
-    """The share of the masks' pixels whose rays miss the unit sphere, in the median of the views."""
-    rays = [view.camera.rays(view.camera.pixels()[thinned(view.known_mask, MAX_PIXELS)]) for view in views]
-    shares = [meet_sphere(each).near.isinf().double().mean().item() for each in rays]
-    return float(np.median(shares)) if shares else 0.0
-
-
 def _distinct(names: Sequence[str]) -> list[str]:
-    """The names; with numbers before them where two are the same, as in folders of several cameras."""
+    """Returns the names; with numbers before them where two are the same, as in folders of several cameras."""
     return list(names) if len(set(names)) == len(names) else [f"{k:03d}_{name}" for k, name in enumerate(names)]
 
 
@@ -120,22 +133,6 @@ def _photograph(shot: Shot) -> Photograph:
         camera = Camera.from_matrices(*matrices, height, width)
         check_intrinsics(camera)
     return Photograph(shot.image.stem, camera, image, mask)
-
-
-def _single(camera: Camera) -> Camera:
-    return replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
-
-
-def _saved(folder: Path, name: str, view: Photograph, placement: Placement) -> dict[str, object]:
-    """What views.json says of a view, whose files are written."""
-    entry: dict[str, object] = {"image": f"images/{name}.png"}
-    save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
-    if view.mask is not None:
-        entry["mask"] = f"masks/{name}.png"
-        save_mask(folder / "masks" / f"{name}.png", view.mask)
-    double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
-    entry["intrinsics"] = view.camera.intrinsics.tolist()
-    return entry | {"T_world_camera": placement.camera_to_world(double).T_world_camera.tolist()}
 
 
 def _remarks(view: Photograph) -> list[str]:
