@@ -1,5 +1,6 @@
 """The checkpoint of a training run: one file, from which a resumed run ends like an uninterrupted one."""
 
+import math
 import operator
 from dataclasses import asdict
 from pathlib import Path
@@ -10,6 +11,7 @@ from distrace.errors import explained
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import written
 from distrace.training.config import TrainConfig
+from distrace.training.losses import COURSE
 from distrace.training.trainer import Training, start
 
 NAME = "checkpoint.pt"
@@ -48,7 +50,8 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
         training.step = operator.index(state["step"])
-        training.losses = [float(loss) for loss in state["losses"]]
+        unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
+        training.losses = [float(loss) for loss in state.get("losses", unknown)]
     if state["names"] != names:
         raise ValueError(
             f"{path} was trained on {len(state['names'])} files of samples, and now there are {len(names)} or others;"
