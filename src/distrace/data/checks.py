@@ -96,7 +96,7 @@ def _away(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
 
 def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> str:
     """The most plausible mistake, if one explains the observation."""
-    away, hint = min((_away(other, pixels, depth), hint) for hint, other in _others(camera).items())
+    away, hint = min((_away(other, pixels, depth), hint) for hint, other in _corrected(camera).items())
     if away <= MAX_MEDIAN_RADIUS:
         return hint
     if not depth.isfinite().any():
@@ -107,20 +107,23 @@ def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
     )
 
 
-def _others(camera: Camera) -> dict[str, Camera]:
-    """Cameras after the usual mistakes are undone, by what to say of each mistake."""
+def _corrected(camera: Camera) -> dict[str, Camera]:
+    """Returns the camera after each of the usual mistakes is undone, by the sentence that names the mistake."""
     pose = camera.T_world_camera
-    centred = camera.intrinsics.clone()
     inverse = torch.linalg.inv(pose)
-    upward = torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    opengl = torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    found = {}
+    for mistake, right in (
+        ("the inverse, T_camera_world", inverse),
+        ("in OpenGL's axes", pose @ opengl),
+        ("the inverse in OpenGL's axes", inverse @ opengl),
+    ):
+        sentence = (
+            f"T_world_camera seems to be {mistake}: it maps camera axes (x right, y down, z forward) to the world"
+        )
+        found[sentence] = replace(camera, T_world_camera=right)
+    centred = camera.intrinsics.clone()
     centred[:2, 2] = centred.new_tensor([camera.width, camera.height]) / 2
-    means = "it maps camera axes (x right, y down, z forward) to the world"
-    poses = {"the inverse, T_camera_world": inverse, "in OpenGL's axes": pose @ upward}
-    poses["the inverse in OpenGL's axes"] = inverse @ upward
-    others = {
-        f"T_world_camera seems to be {what}: {means}": replace(camera, T_world_camera=poses[what]) for what in poses
-    }
-    others["the intrinsics seem to be of another image: look at the principal point"] = replace(
-        camera, intrinsics=centred
-    )
-    return others
+    sentence = "the intrinsics seem to be of another image: look at the principal point"
+    found[sentence] = replace(camera, intrinsics=centred)
+    return found
