@@ -8,7 +8,7 @@ import tarfile
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import IO
+from typing import IO, BinaryIO
 
 from distrace.errors import explained
 
@@ -25,7 +25,9 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
     outside `folder`, or brings the total above `limit` bytes; what was written before that stays.
     """
     with explained(f"{path} cannot be unpacked as a Debian package; download the .deb again", path):
-        packed = _data_tar(_content(path))
+        _check_file(path)
+        with path.open("rb") as handle:
+            packed = _data_tar(handle, path.stat().st_size)
         with tarfile.open(fileobj=io.BytesIO(packed)) as archive:
             _write(_tar_members(archive, below), folder, limit)
             while archive.fileobj and archive.fileobj.read(1 << 20):
@@ -35,38 +37,34 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
 def unpack_zip(path: Path, folder: Path, limit: int = LIMIT) -> None:
     """Writes the files of a zip under `folder`. Raises `ValueError` as `unpack_deb` does."""
     with explained(f"{path} cannot be unpacked as a zip; download it again", path):
-        with zipfile.ZipFile(io.BytesIO(_content(path))) as archive:
+        _check_file(path)
+        with zipfile.ZipFile(path) as archive:
             _write(_zip_members(archive), folder, limit)
 
 
-def _content(path: Path) -> bytes:
+def _check_file(path: Path) -> None:
     if not path.is_file():
         raise ValueError("there is no such file")
-    content = path.read_bytes()
-    if not content:
+    if path.stat().st_size == 0:
         raise ValueError("it is empty")
-    return content
 
 
-def _data_tar(content: bytes) -> bytes:
-    """Returns the packed data.tar inside an `ar` container (deb(5))."""
-    if not content.startswith(b"!<arch>\n"):
+def _data_tar(handle: BinaryIO, size: int) -> bytes:
+    """Returns the packed data.tar inside an `ar` container of `size` bytes (deb(5))."""
+    if handle.read(8) != b"!<arch>\n":
         raise ValueError("it does not begin like one")
-    at = 8
-    while at < len(content):
-        header = content[at : at + 60]
-        at += 60
+    while header := handle.read(60):
         if header[58:] != b"`\n":
             raise ValueError("it is damaged")
         name = header[:16].decode("ascii").rstrip(" /")
         length = int(header[48:58])
-        if not 0 <= length <= len(content) - at:
+        if not 0 <= length <= size - handle.tell():
             raise ValueError("it is cut off")
         if name == "data.tar.zst" and sys.version_info < (3, 14):
             raise ValueError(f"its {name} needs Python 3.14 or one packed as .xz")
         if name.startswith("data.tar"):
-            return content[at : at + length]
-        at += length + length % 2
+            return handle.read(length)
+        handle.seek(length + length % 2, io.SEEK_CUR)
     raise ValueError("it holds no data.tar")
 
 
