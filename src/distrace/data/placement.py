@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -46,7 +47,7 @@ class Placement:
 
 def placement_of(centre: object, radius: object) -> Placement:
     """Raises `ValueError` where they are not three finite numbers and a positive one."""
-    numbers = [*centre, radius] if isinstance(centre, list) else []
+    numbers: list[Any] = [*centre, radius] if isinstance(centre, list) else []
     finite = all(isinstance(value, int | float) and abs(value) <= MAX_COORDINATE for value in numbers)
     if len(numbers) != 4 or not finite or not numbers[3] > 0:
         raise ValueError(
