@@ -11,10 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from distrace.data.catalogue import Mesh, summary, write_catalogue
-from distrace.data.debian import fetch
-from distrace.data.furniture import PACKAGE, catalogue, left_out, prepare
-from distrace.data.properties import properties
+from distrace.data.debian import Mesh, fetch, listed, summary, write_catalogue
+from distrace.data.furniture import PACKAGE, catalogue
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
 ZERO = {
@@ -92,11 +90,10 @@ def test_the_catalogue_lists_every_obj_with_creator_and_licence(deb, tmp_path):
     assert (tmp_path / "out" / home / "copyright").read_text() == "as they say\n"
 
 
-def test_the_summary_counts_what_is_left_out(deb, tmp_path):
+def test_the_summary_counts_categories_and_licences(deb, tmp_path):
     text = summary(catalogue(deb, tmp_path))
     assert text.startswith("4 meshes (2 other, ")
     assert "3 CC0-1.0" in text
-    assert left_out(tmp_path) == 3
 
 
 def test_a_link_in_place_of_the_table_or_of_what_is_unpacked_is_replaced_not_followed(deb, tmp_path):
@@ -107,14 +104,14 @@ def test_a_link_in_place_of_the_table_or_of_what_is_unpacked_is_replaced_not_fol
     (out / "shapes.csv").symlink_to(elsewhere / "passwd")
     (out / f".{PACKAGE}.partial").symlink_to(elsewhere)
     (out / PACKAGE).symlink_to(tmp_path / "nowhere")
-    prepare(out, deb)
+    listed(PACKAGE, catalogue, out, deb)
     assert {path.name: path.read_text() for path in elsewhere.iterdir()} == {"passwd": "root"}
     assert not any(path.is_symlink() for path in out.iterdir())
     assert (out / "shapes.csv").read_text().startswith("category,name")
 
 
 def test_a_table_whose_writing_fails_stays_as_it_was(deb, tmp_path, monkeypatch):
-    meshes = prepare(tmp_path, deb)
+    meshes = listed(PACKAGE, catalogue, tmp_path, deb)
     before = (tmp_path / "shapes.csv").read_text()
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left on device"):
@@ -129,11 +126,11 @@ def full_disk(*given: object) -> None:
 def test_a_full_disk_is_called_full_and_no_download_is_blamed(deb, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "copyfileobj", full_disk)
     with pytest.raises(OSError, match=r"^\[Errno \d+\] No space left on device$"):
-        prepare(tmp_path / "out", deb)
+        listed(PACKAGE, catalogue, tmp_path / "out", deb)
 
 
-def test_prepare_writes_the_table(deb, tmp_path):
-    meshes = prepare(tmp_path / "new/out", deb)
+def test_the_table_is_written(deb, tmp_path):
+    meshes = listed(PACKAGE, catalogue, tmp_path / "new/out", deb)
     with (tmp_path / "new/out/shapes.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["category", "name", "creator", "licence", "debian_package", "path"]
@@ -220,7 +217,7 @@ def test_a_broken_shelf_inside_the_package_is_named(tmp_path):
 
 def test_an_out_that_is_a_file_is_refused(deb):
     with pytest.raises(ValueError, match="choose another --out"):
-        prepare(deb, deb)
+        listed(PACKAGE, catalogue, deb, deb)
 
 
 @pytest.mark.parametrize(
@@ -260,31 +257,6 @@ def test_the_licence_is_read_from_the_catalogue(tmp_path, text, licence):
     members = OTHER | {"LICENSE.TXT": text, "PluginFurnitureCatalog.properties": header}
     path = write_deb(tmp_path / "a.deb", {"sweethome3d/furniture/A.sh3f": shelf(members)})
     assert catalogue(path, tmp_path / "out")[0].licence == licence
-
-
-def test_properties_are_read_as_java_reads_them():
-    content = rb"""
-# comment \
-a=1
- ! another
-b : two words
-c three
-d=one, \
-   #two
-e\=f\:g=tab\tend\\
-h=\u20ac \ud83d\ude00
-empty
-""" + "i=Hôi".encode("latin-1")
-    assert properties(content) == {
-        "a": "1",
-        "b": "two words",
-        "c": "three",
-        "d": "one, #two",
-        "e=f:g": "tab\tend\\",
-        "h": "€ 😀",
-        "empty": "",
-        "i": "Hôi",
-    }
 
 
 def fake_apt_get(folder: Path, script: str) -> str:

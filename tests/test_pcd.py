@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from distrace.data.cloud import read_points
+from distrace.data.cloud import load_cloud, read_points
 from distrace.data.pcd import decompress_lzf, load_pcd
 
 RANDOM = np.random.default_rng(0)
@@ -37,6 +37,12 @@ def test_all_encodings_give_the_same_points(tmp_path: Path, encoding: str) -> No
         body = np.array([len(packed), len(columns)], "<u4").tobytes() + packed
     path.write_bytes(header(encoding) + body)
     np.testing.assert_array_equal(read_points(path), POINTS)
+
+
+def test_a_cloud_in_the_unit_sphere_may_be_a_pcd(tmp_path: Path) -> None:
+    path = tmp_path / "cloud.pcd"
+    path.write_bytes(header("binary") + (POINTS / 2).tobytes())
+    np.testing.assert_array_equal(load_cloud(path).points.numpy(), POINTS / 2)
 
 
 def test_other_fields_lie_between_the_coordinates(tmp_path: Path) -> None:

@@ -7,8 +7,10 @@ import pytest
 from test_furniture import write_deb
 
 from distrace.data.ac3d import load_ac3d, load_surfaces
-from distrace.data.planes import catalogue, parked, prepare, prepare_parked
-from distrace.data.solid import load_solid, load_soup
+from distrace.data.debian import listed
+from distrace.data.mesh_files import load_soup
+from distrace.data.planes import PACKAGE, PARKED_PACKAGE, catalogue, parked
+from distrace.data.solid import load_solid
 
 HEAD = 'AC3Db\nMATERIAL "" rgb 1 1 1  amb 1 1 1  emis 0 0 0  spec 0 0 0  shi 0  trans 0\n'
 TRIANGLE = "SURF 0x10\nmat 0\nrefs 3\n0 0 0\n1 0 0\n2 0 0\n"
@@ -106,7 +108,7 @@ def test_each_aircraft_has_one_mesh_the_one_with_most_in_it(deb: Path, tmp_path:
 
 
 def test_meshes_and_the_copyright_are_kept_and_nothing_else(deb: Path, tmp_path: Path) -> None:
-    prepare(tmp_path / "out", deb)
+    listed(PACKAGE, catalogue, tmp_path / "out", deb)
     home = tmp_path / "out/flightgear-data-ai"
     assert (home / "copyright").read_text() == "as they say\n"
     assert not list(home.rglob("*.xml"))
@@ -147,7 +149,7 @@ def test_each_parked_mesh_is_listed_with_its_images_and_nothing_else_of_the_pack
         f"{root}/Airport/tower.ac": HEAD + poly([TRIANGLE]),
     }
     deb = write_deb(tmp_path / "flightgear-data-base_1_all.deb", {name: text.encode() for name, text in files.items()})
-    meshes = prepare_parked(tmp_path / "out", deb)
+    meshes = listed(PARKED_PACKAGE, parked, tmp_path / "out", deb)
     assert [(mesh.name, mesh.licence) for mesh in meshes] == [(name, "GPL-2.0-or-later") for name in ("jet", "trailer")]
     assert all(len(load_ac3d(tmp_path / "out" / mesh.path)) for mesh in meshes)
     kept = {path.name for path in (tmp_path / "out/flightgear-data-base").iterdir()}

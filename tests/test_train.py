@@ -29,8 +29,7 @@ from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.distillation import Kept
-from distrace.training.hard_samples import CERTAIN, REACH, dwelling
+from distrace.training.fine_tuning import CERTAIN, REACH, Kept, dwelling
 from distrace.training.losses import training_loss
 from distrace.training.trainer import Step, Training, begin_with, bound_codes, start, train
 

@@ -9,10 +9,10 @@ import tyro
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.cli.console import progress, start
-from distrace.data.observation import pictured
 from distrace.data.solid import Solid, normalised
 from distrace.files import written
 from distrace.shading import grid, save_png
+from experiments.datasets.pictured import pictured
 from experiments.procedural import procedural_mesh
 
 PREVIEWED = 32  # shapes

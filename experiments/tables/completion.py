@@ -11,7 +11,7 @@ import trimesh
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model
-from distrace.data.observation import observe, pictured
+from distrace.data.observation import observe
 from distrace.data.samples import sample
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, solid_of
@@ -25,6 +25,7 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
+from experiments.datasets.pictured import pictured
 
 OBSERVATION_SIZE = 256
 SAMPLES = 40_000  # distances that a held-out shape is fitted to

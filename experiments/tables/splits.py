@@ -9,8 +9,9 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
+from distrace.data.mesh_files import load_soup, mesh_of
 from distrace.data.shapes import Shape
-from distrace.data.solid import load_soup, mesh_of, normalised
+from distrace.data.solid import normalised
 from distrace.metrics import surface_points
 
 POINTS = 4000  # of each shape

@@ -15,8 +15,9 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import SimpleMaterial
 
 from distrace.camera import Camera
+from distrace.data.mesh_files import load_soup
 from distrace.data.observation import observe
-from distrace.data.solid import Solid, load_solid, load_soup, turned
+from distrace.data.solid import Solid, load_solid, turned
 from experiments.__main__ import main
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.clutter import NEAREST, boxes, sky

@@ -14,9 +14,9 @@ from distrace.cli.completion import Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
+from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
 from distrace.data.scan import CLOUDS, ScanOptions, load_scan
-from distrace.data.solid import load_geometry
 from distrace.errors import explained
 from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig

@@ -10,12 +10,16 @@ import tyro
 from distrace.cli.common import Flag, default
 from distrace.cli.console import console, origin, progress, start
 from distrace.data import furniture, planes, sampling
-from distrace.data.catalogue import summary
+from distrace.data.debian import listed, summary
 from distrace.data.samples import Doubt
 from distrace.data.shapes import every_mesh, read_split
 from distrace.optional import require
 
-PREPARED = {"furniture": furniture.prepare, "planes": planes.prepare, "parked-planes": planes.prepare_parked}
+SOURCES = {
+    "furniture": (furniture.PACKAGE, furniture.catalogue),
+    "planes": (planes.PACKAGE, planes.catalogue),
+    "parked-planes": (planes.PARKED_PACKAGE, planes.parked),
+}
 
 
 @dataclass(frozen=True)
@@ -30,11 +34,8 @@ class Data:
 
     def run(self) -> None:
         run = start(self.out or Path("out") / self.name)
-        meshes = PREPARED[self.name](run.out, self.source)
-        lines = [summary(meshes)]
-        if self.name == "furniture":
-            lines.append(f"{furniture.left_out(run.out)} models in other formats are left out")
-        run.finish({"source": self.name, "meshes": len(meshes)}, *lines)
+        meshes = listed(*SOURCES[self.name], run.out, self.source)
+        run.finish({"source": self.name, "meshes": len(meshes)}, summary(meshes))
 
 
 @dataclass(frozen=True)

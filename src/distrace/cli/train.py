@@ -24,8 +24,7 @@ from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.distillation import Kept
-from distrace.training.hard_samples import dwelling
+from distrace.training.fine_tuning import Kept, dwelling
 from distrace.training.losses import COURSE
 from distrace.training.trainer import Training, begin_with, faster_in_bfloat16
 from distrace.training.trainer import start as start_training

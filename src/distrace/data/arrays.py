@@ -12,8 +12,8 @@ from distrace.data.checks import check_intrinsics
 from distrace.errors import explained
 
 NAMES = ("depth", "intrinsics", "T_world_camera", "mask", "normal")
-LARGEST = 8192 * 4096  # pixels
-UNIT = 1e-4  # by which a unit normal may be too long
+MAX_PIXELS = 8192 * 4096  # pixels
+LENGTH_TOLERANCE = 1e-4  # by which a unit normal may be too long
 
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
@@ -27,8 +27,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
 def depth_image(array: np.ndarray) -> Float[Tensor, "height width"]:
     """`inf` where there is none: zero, negative, infinite or NaN. Raises `ValueError` where z points backward."""
     depth = _numbers("depth", _flat(array, 2))
-    if depth.dim() != 2 or not 0 < depth.numel() <= LARGEST:
-        most = f"{LARGEST:,} pixels"
+    if depth.dim() != 2 or not 0 < depth.numel() <= MAX_PIXELS:
+        most = f"{MAX_PIXELS:,} pixels"
         raise ValueError(f"depth has shape {list(array.shape)}; an image [height, width] of 1 to {most} is needed")
     finite = depth[depth.isfinite()]
     if not (finite > 0).any() and len(finite[finite < 0].unique()) > 1:
@@ -75,7 +75,7 @@ def normal_image(array: np.ndarray, height: int, width: int) -> Float[Tensor, "h
         raise ValueError(
             "normal is zero or not finite at every pixel; give unit vectors in world axes, or leave it out"
         )
-    unit = torch.where((length - 1).abs() < UNIT, normal, (normal / length).float())
+    unit = torch.where((length - 1).abs() < LENGTH_TOLERANCE, normal, (normal / length).float())
     return torch.where(known, unit, 0.0)
 
 

@@ -9,11 +9,11 @@ from jaxtyping import Float
 from distrace.data.solid import Solid, normalised_frame
 from distrace.metrics import surface_points
 
-OVERALL = 0.2  # an axis is stretched by up to e to this …
-LOCAL = 0.25  # … and parts of it by e to a random function of about this size
+MAX_STRETCH = 0.2  # an axis is stretched by up to e to this …
+LOCAL_STRETCH = 0.25  # … and parts of it by e to a random function of about this size
 WAVES = 3  # half waves along the axis that the function is made of
-EDGE = 0.1  # longer edges are split first, so that they can bend
-SAME = 2e-5  # mean squared distance of a shape to its mirror image up to which it is symmetric
+MAX_EDGE = 0.1  # longer edges are split first, so that they can bend
+MAX_SYMMETRY_ERROR = 2e-5  # mean squared distance of a shape to its mirror image up to which it is symmetric
 KNOTS = np.linspace(-1, 1, 201)
 
 
@@ -21,7 +21,7 @@ def lopsided(solid: Solid, axis: int = 0, count: int = 2000) -> bool:
     """Whether the mirror image in an axis is another shape."""
     points = surface_points(solid.surface, count, seed=0)
     points[:, axis] *= -1
-    return bool(np.mean(solid.distance(points) ** 2) > SAME)
+    return bool(np.mean(solid.distance(points) ** 2) > MAX_SYMMETRY_ERROR)
 
 
 def warped(solid: Solid, random: np.random.Generator) -> Solid:
@@ -33,7 +33,7 @@ def warped(solid: Solid, random: np.random.Generator) -> Solid:
     maps = [_axis_map(random, even=axis != 1 and not lopsided(solid, axis)) for axis in range(3)]
 
     def mapped(mesh: "trimesh.Trimesh") -> "trimesh.Trimesh":
-        vertices, faces, *_ = subdivide_to_size(mesh.vertices, mesh.faces, EDGE, max_iter=20)
+        vertices, faces, *_ = subdivide_to_size(mesh.vertices, mesh.faces, MAX_EDGE, max_iter=20)
         moved = np.stack([np.interp(vertices[:, axis], KNOTS, maps[axis]) for axis in range(3)], axis=1) * mirrored
         return trimesh.Trimesh(moved, faces if mirrored[0] > 0 else faces[:, ::-1], process=False)
 
@@ -49,10 +49,10 @@ def _axis_map(random: np.random.Generator, even: bool) -> Float[np.ndarray, "kno
     """The new coordinates of an axis's knots: the integral of a positive random density."""
     waves = np.arange(1, WAVES + 1)
     phases = np.pi * waves * (KNOTS[:, None] + 1) / 2 + random.uniform(0, 2 * np.pi, WAVES)
-    logarithm = np.cos(phases) @ (random.normal(size=WAVES) * LOCAL / np.sqrt(waves))
+    logarithm = np.cos(phases) @ (random.normal(size=WAVES) * LOCAL_STRETCH / np.sqrt(waves))
     if even:
         logarithm = (logarithm + logarithm[::-1]) / 2
-    density = np.exp(logarithm + random.uniform(-OVERALL, OVERALL))
+    density = np.exp(logarithm + random.uniform(-MAX_STRETCH, MAX_STRETCH))
     steps = (density[1:] + density[:-1]) / 2 * np.diff(KNOTS)
     moved = np.concatenate([[0.0], np.cumsum(steps)])
     return moved - moved[len(KNOTS) // 2]

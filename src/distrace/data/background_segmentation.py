@@ -15,15 +15,15 @@ from distrace.data.photographs import Photographs
 from distrace.data.placement import Placement
 from distrace.data.space_carving import within_masks
 
-DARK = 0.15  # brightness that most pixels along the edges of the images stay below
-SAMPLED = 200_000  # pixels that tell the background's colours
-NOISE = 1 / 255  # standard deviation of a colour, at least
-THREAD = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
-HOLE = 5e-4  # of an image: holes in the object that are smaller are shadows …
-NICHE = 1e-2  # … and so are those that are smaller than this, if their median colour is none of the background's:
-UNLIKELY = 4.03  # standard deviations, beyond which lies one in a thousand of a Gaussian's draws in three dimensions
-LIT = 4  # pixels: what is between background and object, and deeper in the latter, is its shadow; the rest is lit cloth
-UNSURE = 2  # pixels on each side of an outline, within which its place is where the image changes most
+MAX_BACKGROUND_BRIGHTNESS = 0.15  # brightness that most pixels along the edges of the images stay below
+SAMPLED_PIXELS = 200_000  # pixels that tell the background's colours
+MIN_DEVIATION = 1 / 255  # standard deviation of a colour, at least
+DIRT_RADIUS = 2  # pixels: parts that are thinner on both sides are dirt, in an image of 640 × 480
+MAX_SHADOW_SHARE = 5e-4  # of an image: smaller holes in the object are shadows …
+MAX_LIGHT_HOLE_SHARE = 1e-2  # … and so are holes smaller than this, whose median colour is none of the background's
+OUTLIER_DISTANCE = 4.03  # standard deviations, beyond which lies one in a thousand of a 3-D Gaussian's draws
+SHADOW_DEPTH = 4  # pixels: colours between background and object are shadow deeper within it, and lit cloth elsewhere
+OUTLINE_MARGIN = 2  # pixels on each side of an outline, within which its place is where the image changes most
 
 
 def masked(photographs: Photographs) -> Photographs:
@@ -36,8 +36,9 @@ def masked(photographs: Photographs) -> Photographs:
     if all(view.mask is not None for view in views):
         return photographs
     without = [view.name for view in views if view.mask is None]
-    edges = np.concatenate([_edge(view.image.amax(-1).numpy()) for view in views])
-    if np.median(edges) > DARK:
+    bright = [view.image.amax(-1).numpy() for view in views]
+    edges = np.concatenate([side for image in bright for side in (image[0], image[-1], image[:, 0], image[:, -1])])
+    if np.median(edges) > MAX_BACKGROUND_BRIGHTNESS:
         raise ValueError(
             f"{without[0]} and {len(without) - 1} others have no mask, and their background is not dark: half of the"
             f" pixels along the edges are brighter than {np.median(edges):.2f}; give masks, white where the object is"
@@ -63,50 +64,49 @@ def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torc
     about them, for thresholds dilate what is bright, a watershed puts the outline where the image changes most.
     """
     colours = np.concatenate([image.numpy().reshape(-1, 3) for image in images])
-    colours = colours[:: -(-len(colours) // SAMPLED)].astype(np.float64)
+    colours = colours[:: -(-len(colours) // SAMPLED_PIXELS)].astype(np.float64)
     bright = colours.max(-1)
-    if bright.max() - bright.min() < NOISE:
+    if bright.max() - bright.min() < MIN_DEVIATION:
         raise ValueError(
             f"all {len(images)} images have one brightness, {bright.max():.2f}: nothing stands out; give masks"
         )
     dark = colours[bright < threshold_li(bright)]
     mean = dark.mean(0)
-    whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + NOISE**2 * np.eye(3)))
-    apart = _apart(colours, mean, whiten)
-    low = threshold_li(apart)
-    high = max(threshold_otsu(apart), low)
+    whiten = np.linalg.inv(np.linalg.cholesky(np.cov(dark.T) + MIN_DEVIATION**2 * np.eye(3)))
+    distance = _deviations(colours, mean, whiten)
+    low = threshold_li(distance)
+    high = max(threshold_otsu(distance), low)
     smooth = (gaussian(image.numpy(), 1.0, channel_axis=-1) for image in images)
-    return [torch.from_numpy(_stands_out(_apart(image, mean, whiten), low, high)) for image in smooth]
+    return [torch.from_numpy(_stands_out(_deviations(image, mean, whiten), low, high)) for image in smooth]
 
 
-def _apart(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+def _deviations(colours: np.ndarray, mean: np.ndarray, whiten: np.ndarray) -> np.ndarray:
+    """Returns Mahalanobis distances from the background's mean colour."""
     return np.linalg.norm((colours - mean) @ whiten.T, axis=-1)
 
 
-def _stands_out(apart: np.ndarray, low: float, high: float) -> np.ndarray:
-    about, surely = (_largest(apart > threshold) for threshold in (low, high))
-    core = erosion(surely, disk(UNSURE)) | skeletonize(surely) | erosion(about, disk(LIT))  # a skeleton keeps threads
-    markers = np.where(dilation(about, disk(UNSURE)), 0, 1)
+def _stands_out(distance: np.ndarray, low: float, high: float) -> np.ndarray:
+    about, surely = (_largest(distance > threshold) for threshold in (low, high))
+    core = erosion(surely, disk(OUTLINE_MARGIN)) | erosion(about, disk(SHADOW_DEPTH))
+    core |= skeletonize(surely)  # keeps threads
+    markers = np.where(dilation(about, disk(OUTLINE_MARGIN)), 0, 1)
     markers[core] = 2
-    return _with_niches(np.asarray(watershed(sobel(apart), markers) == 2), apart)
+    return _with_niches(np.asarray(watershed(sobel(distance), markers) == 2), distance)
 
 
-def _with_niches(mask: np.ndarray, apart: np.ndarray) -> np.ndarray:
+def _with_niches(mask: np.ndarray, distance: np.ndarray) -> np.ndarray:
     """With the holes that are too small for background, and lighter."""
-    parts = np.asarray(label(remove_small_holes(mask, max_size=round(NICHE * mask.size)) & ~mask, connectivity=1))
-    lighter = [hole for hole in range(1, parts.max() + 1) if np.median(apart[parts == hole]) > UNLIKELY]
+    holes = remove_small_holes(mask, max_size=round(MAX_LIGHT_HOLE_SHARE * mask.size)) & ~mask
+    parts = np.asarray(label(holes, connectivity=1))
+    lighter = [hole for hole in range(1, parts.max() + 1) if np.median(distance[parts == hole]) > OUTLIER_DISTANCE]
     return mask | np.isin(parts, lighter)
 
 
 def _largest(mask: np.ndarray) -> np.ndarray:
     """The largest part, without dirt and with its shadows."""
-    parts = np.asarray(label(opening(mask, disk(THREAD))))
+    parts = np.asarray(label(opening(mask, disk(DIRT_RADIUS))))
     largest = parts == (1 + np.bincount(parts.ravel())[1:].argmax() if parts.any() else -1)
-    return np.asarray(remove_small_holes(largest, max_size=round(HOLE * parts.size)))
-
-
-def _edge(image: np.ndarray) -> np.ndarray:
-    return np.concatenate([image[0], image[-1], image[:, 0], image[:, -1]])
+    return np.asarray(remove_small_holes(largest, max_size=round(MAX_SHADOW_SHARE * parts.size)))
 
 
 def _placed_again(photographs: Photographs) -> Photographs:

@@ -11,14 +11,14 @@ from distrace.camera import Camera
 from distrace.errors import DoubtfulResult
 from distrace.pixels import thinned
 
-WIDEST = 160.0  # degrees: largest field of view of a pinhole camera
-OBLONG = 4.0  # largest ratio of the two focal lengths
-COARSER = 1.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
+MAX_FIELD_OF_VIEW = 160.0  # degrees: largest field of view of a pinhole camera
+MAX_FOCAL_RATIO = 4.0  # largest ratio of the two focal lengths
+OTHER_RESOLUTION = 1.8  # times: intrinsics with a principal point that far beyond the middle are of another resolution
 OFF_CENTRE = 0.2  # of an image: a principal point that far from the middle may be of another resolution …
-EVENLY = 0.1  # … if it is about as far along both sides: the logarithm of the ratio
-RATHER = 0.02  # least share of depths within a mask, relative to that beyond it
-ALMOST = 1.2  # radii: largest median distance from the origin of a shape in the unit sphere
-MOST = 100_000  # pixels that are examined
+MAX_LOG_RATIO = 0.1  # … if it is about as far along both sides: the logarithm of the ratio
+MIN_DEPTH_RATIO = 0.02  # least share of depths within a mask, relative to that beyond it
+MAX_MEDIAN_RADIUS = 1.2  # radii: largest median distance from the origin of a shape in the unit sphere
+MAX_PIXELS = 100_000  # pixels that are examined
 
 
 def check_intrinsics(camera: Camera) -> None:
@@ -29,14 +29,14 @@ def check_intrinsics(camera: Camera) -> None:
     middle = across[:2, 2] / size
     image = f"an image of {camera.height} × {camera.width} pixels"
     angle = torch.rad2deg(2 * torch.atan(camera.width / (2 * across[0, 0]))).item()
-    if angle > WIDEST:
+    if angle > MAX_FIELD_OF_VIEW:
         raise ValueError(f"a focal length of {fx:.4g} pixels sees {angle:.0f}° in {image}; intrinsics are in pixels")
-    if not 1 / OBLONG < fx / fy < OBLONG:
+    if not 1 / MAX_FOCAL_RATIO < fx / fy < MAX_FOCAL_RATIO:
         raise ValueError(f"focal lengths of {fx:.4g} and {fy:.4g} pixels were given; they cannot differ so much")
-    if (middle[0] / middle[1]).log().abs() < EVENLY and (middle - 0.5).abs().min() > OFF_CENTRE:
+    if (middle[0] / middle[1]).log().abs() < MAX_LOG_RATIO and (middle - 0.5).abs().min() > OFF_CENTRE:
         point = " × ".join(f"{2 * length:.4g}" for length in across[:2, 2].flip(0).tolist())
         sentence = f"the intrinsics are for an image of {point} pixels, and this is {image}; scale them with it"
-        if middle.min() > COARSER / 2:
+        if middle.min() > OTHER_RESOLUTION / 2:
             raise ValueError(sentence)
         warnings.warn(f"if this is no part of an image, {sentence}", DoubtfulResult, stacklevel=4)
 
@@ -51,7 +51,7 @@ def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height wi
     outside = (~mask).sum().item()
     if not inside:
         raise ValueError(f"mask marks no pixel as object, but {beyond} have a depth; mark the object, or leave it out")
-    if within / inside < RATHER * beyond / max(outside, 1):
+    if within / inside < MIN_DEPTH_RATIO * beyond / max(outside, 1):
         raise ValueError(
             f"mask marks {inside} pixels as object, of which {within} have a depth, as have {beyond} of the {outside}"
             " others; is it inverted, or of another image?"
@@ -60,7 +60,7 @@ def check_mask(mask: Bool[Tensor, "height width"], seen: Bool[Tensor, "height wi
 
 def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> None:
     """Raises `ValueError` where most of what is seen turns its back to the camera."""
-    known = thinned(normal.any(-1), MOST)
+    known = thinned(normal.any(-1), MAX_PIXELS)
     directions = camera.rays(camera.pixels()[known]).directions
     facing = ((normal[known] * directions).sum(-1) < 0).float().mean()
     if facing < 0.5:
@@ -72,11 +72,11 @@ def check_normals(camera: Camera, normal: Float[Tensor, "height width 3"]) -> No
 
 def check_place(camera: Camera, depth: Float[Tensor, "height width"], observed: Bool[Tensor, "height width"]) -> None:
     """Raises `ValueError` where what was observed is not in the unit sphere, or the camera does not see that."""
-    chosen = thinned(depth.isfinite() if depth.isfinite().any() else observed, MOST)
+    chosen = thinned(depth.isfinite() if depth.isfinite().any() else observed, MAX_PIXELS)
     pixels = camera.pixels()[chosen]
     depth = depth[chosen]
     away = _away(camera, pixels, depth)
-    if away <= ALMOST:
+    if away <= MAX_MEDIAN_RADIUS:
         return
     what = "its points lie" if depth.isfinite().any() else "the rays of the object pass"
     there = camera.T_world_camera[:3, 3].norm()
@@ -96,8 +96,8 @@ def _away(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
 
 def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"]) -> str:
     """The most plausible mistake, if one explains the observation."""
-    away, hint = min((_away(other, pixels, depth), hint) for hint, other in _others(camera).items())
-    if away <= ALMOST:
+    away, hint = min((_away(other, pixels, depth), hint) for hint, other in _corrected(camera).items())
+    if away <= MAX_MEDIAN_RADIUS:
         return hint
     if not depth.isfinite().any():
         return "T_world_camera maps camera axes (x right, y down, z forward) to the world: turn it to the shape"
@@ -107,20 +107,23 @@ def _hint(camera: Camera, pixels: Float[Tensor, "n 2"], depth: Float[Tensor, "n"
     )
 
 
-def _others(camera: Camera) -> dict[str, Camera]:
-    """Cameras after the usual mistakes are undone, by what to say of each mistake."""
+def _corrected(camera: Camera) -> dict[str, Camera]:
+    """Returns the camera after each of the usual mistakes is undone, by the sentence that names the mistake."""
     pose = camera.T_world_camera
-    centred = camera.intrinsics.clone()
     inverse = torch.linalg.inv(pose)
-    upward = torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    opengl = torch.diag(pose.new_tensor([1, -1, -1, 1]))
+    found = {}
+    for mistake, right in (
+        ("the inverse, T_camera_world", inverse),
+        ("in OpenGL's axes", pose @ opengl),
+        ("the inverse in OpenGL's axes", inverse @ opengl),
+    ):
+        sentence = (
+            f"T_world_camera seems to be {mistake}: it maps camera axes (x right, y down, z forward) to the world"
+        )
+        found[sentence] = replace(camera, T_world_camera=right)
+    centred = camera.intrinsics.clone()
     centred[:2, 2] = centred.new_tensor([camera.width, camera.height]) / 2
-    means = "it maps camera axes (x right, y down, z forward) to the world"
-    poses = {"the inverse, T_camera_world": inverse, "in OpenGL's axes": pose @ upward}
-    poses["the inverse in OpenGL's axes"] = inverse @ upward
-    others = {
-        f"T_world_camera seems to be {what}: {means}": replace(camera, T_world_camera=poses[what]) for what in poses
-    }
-    others["the intrinsics seem to be of another image: look at the principal point"] = replace(
-        camera, intrinsics=centred
-    )
-    return others
+    sentence = "the intrinsics seem to be of another image: look at the principal point"
+    found[sentence] = replace(camera, intrinsics=centred)
+    return found

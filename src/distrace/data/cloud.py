@@ -1,4 +1,4 @@
-"""Points of a surface, as a scanner gives them: no camera, perhaps normals. The file form is PLY."""
+"""Points of a surface, as a scanner gives them: no camera, perhaps normals."""
 
 import warnings
 from dataclasses import dataclass, replace
@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.checks import ALMOST
+from distrace.data.checks import MAX_MEDIAN_RADIUS
+from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
-from distrace.data.solid import load_geometry
-from distrace.errors import DoubtfulResult, about, explained
+from distrace.errors import DoubtfulResult, explained
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Cloud:
         return Cloud(self.points.to(device), None if self.normals is None else self.normals.to(device))
 
     def sparse(self, count: int, seed: int = 0) -> "Cloud":
-        """At most so many of the points, drawn at random."""
+        """Returns at most `count` of the points, drawn at random."""
         chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
         return Cloud(self.points[chosen], None if self.normals is None else self.normals[chosen])
 
@@ -37,7 +37,7 @@ class Cloud:
         return replace(self, normals=None) if "normal" in parts else self
 
     def seen_from(self, camera: Camera) -> View:
-        """The points as depths of the pixels that they fall into, the nearest of each; none hides another's pixel."""
+        """Returns the points as depths of the pixels that they fall into, the nearest of each; none hides another's."""
         pixels, depths = camera.project(self.points)
         shown = camera.shows(pixels, depths)
         column, row = pixels[shown].long().unbind(-1)
@@ -47,37 +47,32 @@ class Cloud:
 
 
 def load_cloud(path: Path) -> Cloud:
-    """Reads points, or a mesh's vertices, and their normals where the file has them.
+    """Reads points, or a mesh's vertices, in the frame of the unit sphere, and their normals where the file has them.
 
     Points that are not finite, or whose normals have no direction, are dropped, and a `DoubtfulResult` says how many.
     Raises `ValueError`, in one sentence, for what holds no point or makes no sense.
     """
-    with explained(f"{path} cannot be read as a cloud of points; give a PLY in the frame of the unit sphere", path):
-        loaded = load_geometry(path)
-        points = torch.tensor(np.asarray(getattr(loaded, "vertices", np.empty((0, 3)))), dtype=torch.float32)
-        normals = _normals(loaded)
-    with about(path):
-        usable = points.isfinite().all(-1)
-        if not usable.any():
-            raise ValueError(f"it has {len(points)} points, and none that is finite")
-        if normals is not None:
-            directed = normals.any(-1)
-            if (usable & directed).sum() < usable.sum() / 2:
-                normals = None
-                _warn(f"{path}: most of its normals have no direction, and none is used")
-            else:
-                usable &= directed
-        if not usable.all():
-            _warn(f"{path}: {(~usable).sum()} points that are not finite, or whose normals are not, were dropped")
-        points = points[usable]
-        normals = None if normals is None else normals[usable]
-        away = points.norm(dim=-1).median().item()
-        if away > ALMOST or away < ALMOST / 100:
-            raise ValueError(
-                f"its points lie {away:.3g} from the origin in the median, but the shape must be in the unit sphere"
-                " around the origin: centre it and divide by its largest radius"
-            )
-    return Cloud(points, normals)
+    points, normals = _read(path, "give a PLY in the frame of the unit sphere")
+    usable = _finite(path, points)
+    if normals is not None:
+        directed = normals.any(-1)
+        if (usable & directed).sum() < usable.sum() / 2:
+            normals = None
+            _warn(f"{path}: most of its normals have no direction, and none is used")
+        else:
+            usable &= directed
+    if not usable.all():
+        _warn(f"{path}: {(~usable).sum()} points that are not finite, or whose normals are not, were dropped")
+    cloud = Cloud(
+        torch.from_numpy(points[usable]).float(), None if normals is None else torch.from_numpy(normals[usable]).float()
+    )
+    away = cloud.points.norm(dim=-1).median().item()
+    if away > MAX_MEDIAN_RADIUS or away < MAX_MEDIAN_RADIUS / 100:
+        raise ValueError(
+            f"{path}: its points lie {away:.3g} from the origin in the median, but the shape must be in the unit sphere"
+            " around the origin: centre it and divide by its largest radius"
+        )
+    return cloud
 
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
@@ -85,33 +80,42 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
     A `DoubtfulResult` says how many were dropped. Raises `ValueError` for a file without any.
     """
-    with explained(f"{path} cannot be read as a cloud of points; give a PLY, PCD or XYZ file", path):
-        if path.suffix.lower() == ".pcd":
-            columns = load_pcd(path)
-            points = np.stack([columns[axis] for axis in "xyz"], axis=1)
-        else:
-            loaded = load_geometry(path)
-            points = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64)
-    usable = np.isfinite(points).all(1)
-    if not usable.any():
-        raise ValueError(f"{path}: it has {len(points)} points, and none that is finite")
+    points, _ = _read(path, "give a PLY, PCD or XYZ file")
+    usable = _finite(path, points)
     if not usable.all():
         _warn(f"{path}: {(~usable).sum()} points that are not finite were dropped")
     return points[usable]
 
 
-def _warn(sentence: str) -> None:
-    warnings.warn(sentence, DoubtfulResult, stacklevel=4)
+def _read(path: Path, advice: str) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None]:
+    with explained(f"{path} cannot be read as a cloud of points; {advice}", path):
+        if path.suffix.lower() == ".pcd":
+            columns = load_pcd(path)
+            return np.stack([columns[axis] for axis in "xyz"], axis=1), None
+        loaded = load_geometry(path)
+        return np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float64), _normals(loaded)
 
 
-def _normals(loaded: Any) -> Float[Tensor, "n 3"] | None:
-    """Those of the file, of unit length, or zero where they have no direction; a mesh's are not made up."""
+def _finite(path: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    with np.errstate(over="ignore"):  # what is too large for float32 becomes inf
+        usable = np.isfinite(points.astype(np.float32)).all(1)
+    if not usable.any():
+        raise ValueError(f"{path}: it has {len(points)} points, and none that is finite")
+    return usable
+
+
+def _normals(loaded: Any) -> Float[np.ndarray, "n 3"] | None:
+    """Returns those of the file, of unit length, or zero where they have no direction; a mesh's are not made up."""
     vertices = loaded.metadata.get("_ply_raw", {}).get("vertex", {})
     names = ("nx", "ny", "nz")
     if not set(names) <= set(vertices.get("properties", ())):
         return None
-    columns = [np.asarray(vertices["data"][name]).reshape(-1) for name in names]
-    normals = torch.tensor(np.stack(columns, axis=-1), dtype=torch.float32)
-    length = normals.norm(dim=-1, keepdim=True)
-    normals = torch.where((length > 1e-6) & length.isfinite(), normals, 0.0)
-    return torch.nn.functional.normalize(normals, dim=-1)
+    columns = [np.asarray(vertices["data"][name], np.float64).reshape(-1) for name in names]
+    normals = np.stack(columns, axis=-1)
+    length = np.linalg.norm(normals, axis=-1, keepdims=True)
+    known = (length > 1e-6) & np.isfinite(length)
+    return np.where(known, normals, 0.0) / np.where(known, length, 1.0)
+
+
+def _warn(sentence: str) -> None:
+    warnings.warn(sentence, DoubtfulResult, stacklevel=3)

@@ -1,42 +1,84 @@
-"""Debian's packages as a source of meshes: fetched by apt-get, unpacked once."""
+"""Catalogues of the meshes in Debian's packages, which apt-get fetches: unpacked once, and listed in a table."""
 
+import csv
+import io
 import shutil
 import subprocess
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from distrace.data.archive import unpack_deb
 from distrace.errors import explained
+from distrace.files import save_text
 
-_STAMP = "unpacked-from.txt"
+STAMP = "unpacked-from.txt"
 DOCUMENTS = "usr/share/doc"
+COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
+
+
+@dataclass(frozen=True)
+class Mesh:
+    category: str
+    name: str
+    creator: str
+    licence: str  # SPDX
+    package: str
+    path: Path  # relative to the catalogue's folder
+
+
+def listed(
+    package: str, catalogue: Callable[[Path, Path], list[Mesh]], out: Path, deb: Path | None = None
+) -> list[Mesh]:
+    """Returns the meshes of a package, unpacked under `out` and listed in out/shapes.csv; fetched if `deb` is None.
+
+    Raises `ValueError` if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
+    """
+    with explained(f"{out} cannot be written to; choose another --out"):
+        out.mkdir(parents=True, exist_ok=True)
+    meshes = catalogue(deb or fetch(package, out), out)
+    write_catalogue(meshes, out / "shapes.csv")
+    return meshes
+
+
+def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
+    """Writes the meshes as CSV in UTF-8, a row each. Raises `ValueError` if `path` cannot be written."""
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    writer.writerows((m.category, m.name, m.creator, m.licence, m.package, m.path.as_posix()) for m in meshes)
+    with explained(f"{path} cannot be written; choose another --out"):
+        save_text(path, table.getvalue())
+
+
+def summary(meshes: Sequence[Mesh]) -> str:
+    """Returns the counts by category and licence."""
+    categories = _counted(mesh.category for mesh in meshes)
+    licences = _counted(mesh.licence for mesh in meshes)
+    return f"{len(meshes)} meshes ({categories}; {licences})"
 
 
 def by_hand(package: str) -> str:
-    """What to do where a package cannot be fetched."""
+    """Returns what to do where a package cannot be fetched."""
     return f"download the .deb by hand from https://packages.debian.org/{package} and pass --from FILE.deb"
 
 
 def fetch(package: str, folder: Path) -> Path:
-    """The package's .deb in `folder`, by `apt-get download` unless it is there already; else a ValueError."""
-    present = sorted(folder.glob(f"{package}_*.deb"))
+    """Returns the .deb in `folder`, downloaded by apt-get if it is not there. Raises `ValueError` if that fails."""
+    pattern = f"{package}_*.deb"
+    present = sorted(folder.glob(pattern))
     if present:
         return present[-1]
-    sentence = f"apt-get cannot download {package}; {by_hand(package)}"
     # apt-get writes under the final name from the first byte: an interrupted file must not look whole.
-    with explained(sentence), TemporaryDirectory(dir=folder) as partial:
-        downloaded = _download(package, Path(partial))
-        return downloaded.replace(folder / downloaded.name)
-
-
-def _download(package: str, folder: Path) -> Path:
-    command = ["apt-get", "download", package]
-    done = subprocess.run(command, check=False, cwd=folder, stdin=subprocess.DEVNULL, capture_output=True, text=True)
-    found = list(folder.glob(f"{package}_*.deb"))
-    if done.returncode or not found:
-        raise ValueError(done.stderr.strip().rpartition("\n")[2])
-    return found[0]
+    with explained(f"apt-get cannot download {package}; {by_hand(package)}"), TemporaryDirectory(dir=folder) as partial:
+        command = ["apt-get", "download", package]
+        done = subprocess.run(command, cwd=partial, stdin=subprocess.DEVNULL, capture_output=True, text=True)
+        found = list(Path(partial).glob(pattern))
+        if done.returncode or not found:
+            raise ValueError(done.stderr.strip().rpartition("\n")[2])
+        return found[0].replace(folder / found[0].name)
 
 
 def unpacked(
@@ -47,16 +89,16 @@ def unpacked(
     keeping: str = "",
     below: str = "",  # the only folder of the package that is unpacked, for `arrange`
 ) -> Path:
-    """The package's folder under `folder`: what `arrange` takes there from the files of the .deb, and `copyright`.
+    """Returns the package's folder under `folder`: what `arrange` takes there from the .deb, and `copyright`.
 
-    A second call unpacks nothing: a stamp, written last, names the .deb and what was kept of it. Raises ValueError if
-    `deb` is missing or broken, or if something else has the folder's name.
+    A second call unpacks nothing: a stamp, written last, names the .deb and what was kept of it. Raises `ValueError`
+    if `deb` is missing or broken, or if something else has the folder's name.
     """
     if not deb.is_file():
         raise ValueError(f"there is no file {deb}; {by_hand(package)}")
     home = folder / package
     source = f"{deb.name} {deb.stat().st_size} {keeping}".rstrip() + "\n"
-    stamp = home / _STAMP
+    stamp = home / STAMP
     if stamp.is_file() and stamp.read_text() == source:
         return home
     if home.exists() and not stamp.is_file():
@@ -69,14 +111,18 @@ def unpacked(
     for licences in content.glob(f"{DOCUMENTS}/*/copyright"):
         licences.replace(partial / "copyright")
     shutil.rmtree(content)
-    (partial / _STAMP).write_text(source)
+    (partial / STAMP).write_text(source)
     _remove(home)
     return partial.replace(home)
 
 
 def _remove(path: Path) -> None:
-    """A folder with all that is in it; of a link only the link."""
+    """Removes a folder with all that is in it; of a link only the link."""
     if path.is_symlink() or path.is_file():
         path.unlink()
     elif path.exists():
         shutil.rmtree(path)
+
+
+def _counted(words: Iterable[str]) -> str:
+    return ", ".join(f"{count} {word}" for word, count in Counter(words).most_common())

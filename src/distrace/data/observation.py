@@ -23,12 +23,12 @@ CANONICAL = "canonical"
 
 @dataclass(frozen=True)
 class View:
-    """Depth z in the units of the unit sphere, `inf` where there is none; the mask, if known, says what is object."""
+    """An observation of a shape in the unit sphere: a depth image, and a mask and normals where they are known."""
 
     camera: Camera
-    depth: Float[Tensor, "height width"]
-    mask: Bool[Tensor, "height width"] | None = None
-    normal: Float[Tensor, "height width 3"] | None = None
+    depth: Float[Tensor, "height width"]  # z; `inf` where there is none
+    mask: Bool[Tensor, "height width"] | None = None  # where the object is
+    normal: Float[Tensor, "height width 3"] | None = None  # unit vectors in world axes; zero where unknown
 
     @property
     def seen(self) -> Bool[Tensor, "height width"]:
@@ -137,24 +137,15 @@ def save_view(path: Path, view: View) -> None:
 
 
 def observe(solid: Solid, camera: Camera) -> View:
-    """What the camera sees of a mesh's outer surface, by Embree's ray casting: nothing of ours but the camera."""
+    """Returns what the camera sees of a mesh's outer surface, by Embree's ray casting."""
     rays = camera.rays()
     origins = rays.origins.reshape(-1, 3).numpy()
     directions = rays.directions.reshape(-1, 3).numpy()
     cast: Any = solid.surface.ray.intersects_id
     faces, pixels, points = cast(origins, directions, multiple_hits=False, return_locations=True)
-    _, depths = camera.project(torch.from_numpy(points).float())
-    depth = torch.full((camera.height * camera.width,), torch.inf)
-    depth[pixels] = depths
-    normal = torch.zeros(len(depth), 3)
+    depth = torch.full((len(origins),), torch.inf)
+    depth[pixels] = camera.project(torch.from_numpy(points).float())[1]
+    normal = torch.zeros(len(origins), 3)
     normal[pixels] = torch.from_numpy(solid.surface.face_normals[faces]).float()
-    shape = (camera.height, camera.width)
-    depth = depth.reshape(shape)
-    return View(camera, depth, torch.isfinite(depth), normal.reshape(*shape, 3))
-
-
-def pictured(solid: Solid, camera: Camera) -> Picture:
-    """A mesh's outer surface as clay."""
-    picture = observe(solid, camera).shaded
-    assert picture is not None
-    return picture
+    depth = depth.reshape(camera.height, camera.width)
+    return View(camera, depth, torch.isfinite(depth), normal.reshape(*depth.shape, 3))

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 TYPES = {"F": "f", "I": "i", "U": "u"}
-LARGEST_HEADER = 4096  # bytes
+MAX_HEADER = 4096  # bytes
 
 
 def load_pcd(path: Path) -> dict[str, Float[np.ndarray, "n"]]:
@@ -15,7 +15,7 @@ def load_pcd(path: Path) -> dict[str, Float[np.ndarray, "n"]]:
     Raises `ValueError` for a file that is no PCD, or that ends early.
     """
     content = path.read_bytes()
-    end = content.find(b"DATA ", 0, LARGEST_HEADER)
+    end = content.find(b"DATA ", 0, MAX_HEADER)
     if end < 0:
         raise ValueError("it has no line DATA, as PCD files do")
     lines = content[:end].decode("ascii", "replace").splitlines()

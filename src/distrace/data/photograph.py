@@ -9,7 +9,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 
-SLIVER = 1e-3  # pixels: what a last row or column covers at least, where the factor is not exact
+MIN_COVERED = 1e-3  # pixels: what a last row or column covers at least, where the factor is not exact
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ def _averaged(image: Float[Tensor, "rows columns channels"], factor: float) -> F
     """Along the rows, by differences of the integral: exact for any factor."""
     length = image.shape[0]
     edges = torch.arange(math.ceil(length * factor) + 1, dtype=torch.float64, device=image.device) / factor
-    start = edges[:-1].clamp_max(length - SLIVER)
+    start = edges[:-1].clamp_max(length - MIN_COVERED)
     end = edges[1:].clamp_max(length)
     integral = torch.cat([torch.zeros_like(image[:1]), image.cumsum(0)])
     return (_between(integral, end) - _between(integral, start)) / (end - start)[:, None, None]

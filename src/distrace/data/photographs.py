@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float
-from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import check_intrinsics
 from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
-from distrace.data.photo_readers.frames import Shot, Shots, inside
+from distrace.data.photo_readers.frames import Shot, inside
 from distrace.data.photograph import Photograph as Photograph
 from distrace.data.pictures import read_mask, read_picture, save_mask, save_picture
 from distrace.data.placement import Placement as Placement
@@ -28,9 +27,9 @@ LOOKED_FOR = (
     "views.json, transforms.json, transforms_train.json, cameras_sphere.npz, *_par.txt, and COLMAP's cameras.bin or"
     " cameras.txt in sparse/0, sparse and the folder itself"
 )
-BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
-MOST = 20_000  # pixels of a mask that are examined
-GLARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
+MAX_SHARE_BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
+MAX_PIXELS = 20_000  # pixels of a mask that are examined
+MAX_WHITE_SHARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
 
 
 @dataclass(frozen=True)
@@ -44,11 +43,15 @@ class Photographs:
 
 
 def load_photographs(folder: Path) -> Photographs:
-    """The photographs of a folder, in whichever layout it has.
+    """Reads the photographs of a folder, in whichever layout it has.
 
     Raises `ValueError`, in one sentence that names file and field, for what is missing or makes no sense.
     """
-    shots = _described(folder)
+    if not folder.is_dir():
+        raise ValueError(f"there is no folder {folder}")
+    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
+    if shots is None:
+        raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
     if len(shots.views) < 2:
         raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
     names = _distinct([shot.image.stem for shot in shots.views])
@@ -58,19 +61,33 @@ def load_photographs(folder: Path) -> Photographs:
         if len(masks) == len(views) and not any(mask.any() for mask in masks):
             raise ValueError(f"its {len(masks)} masks mark no pixel as object; they are white where the object is")
         placement = shots.placement or estimated(views, shots.points)
-    placed = [replace(view, camera=_single(placement.camera_to_unit(view.camera))) for view in views]
+    placed = []
+    for view in views:
+        camera = placement.camera_to_unit(view.camera)
+        single = replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
+        placed.append(replace(view, camera=single))
     return Photographs(tuple(placed), placement, shots.layout, shots.placement is not None)
 
 
 def save_photographs(folder: Path, photographs: Photographs) -> None:
-    """Our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
+    """Writes our own layout: `views.json`, and images and masks as PNG of eight bits beside it."""
+    entries = []
     names = _distinct([view.name for view in photographs.views])
-    entries = [_saved(folder, name, view, photographs.placement) for name, view in zip(names, photographs.views)]
+    for name, view in zip(names, photographs.views):
+        entry: dict[str, object] = {"image": f"images/{name}.png"}
+        save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
+        if view.mask is not None:
+            entry["mask"] = f"masks/{name}.png"
+            save_mask(folder / "masks" / f"{name}.png", view.mask)
+        double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
+        entry["intrinsics"] = view.camera.intrinsics.tolist()
+        entry["T_world_camera"] = photographs.placement.camera_to_world(double).T_world_camera.tolist()
+        entries.append(entry)
     save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.placement.described()})
 
 
 def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> Placement:
-    """From the masks if two views have one, else from points that are known, else from where the cameras look.
+    """Returns the sphere around the masks if two views have one, else around known points, else where cameras look.
 
     Raises `ValueError` where none of these tells.
     """
@@ -82,33 +99,23 @@ def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"]
 
 
 def notes(photographs: Photographs) -> list[str]:
-    """Sentences about views that can be used but look wrong."""
-    found = [f"{view.name} {remark}" for view in photographs.views for remark in _remarks(view)]
-    beyond = _beyond([view for view in photographs.views if view.mask is not None and view.mask.any()])
-    if beyond > BEYOND:
+    """Returns sentences about views that can be used but look wrong."""
+    found = []
+    shares_beyond = []  # of each mask's pixels, those whose rays miss the unit sphere
+    for view in photographs.views:
+        found += [f"{view.name} {remark}" for remark in _remarks(view)]
+        if view.mask is not None and view.mask.any():
+            rays = view.camera.rays(view.camera.pixels()[thinned(view.mask, MAX_PIXELS)])
+            shares_beyond.append(meet_sphere(rays).near.isinf().double().mean().item())
+    beyond = float(np.median(shares_beyond)) if shares_beyond else 0.0
+    if beyond > MAX_SHARE_BEYOND:
         found.append(f"{beyond:.0%} of the object in the masks lies beyond the unit sphere; give a larger radius")
     return found
 
 
-def _beyond(views: Sequence[Photograph]) -> float:
-    """The share of the masks' pixels whose rays miss the unit sphere, in the median of the views."""
-    rays = [view.camera.rays(view.camera.pixels()[thinned(view.known_mask, MOST)]) for view in views]
-    shares = [meet_sphere(each).near.isinf().double().mean().item() for each in rays]
-    return float(np.median(shares)) if shares else 0.0
-
-
 def _distinct(names: Sequence[str]) -> list[str]:
-    """The names; with numbers before them where two are the same, as in folders of several cameras."""
+    """Returns the names; with numbers before them where two are the same, as in folders of several cameras."""
     return list(names) if len(set(names)) == len(names) else [f"{k:03d}_{name}" for k, name in enumerate(names)]
-
-
-def _described(folder: Path) -> Shots:
-    if not folder.is_dir():
-        raise ValueError(f"there is no folder {folder}")
-    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
-    if shots is None:
-        raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
-    return shots
 
 
 def _photograph(shot: Shot) -> Photograph:
@@ -128,44 +135,18 @@ def _photograph(shot: Shot) -> Photograph:
     return Photograph(shot.image.stem, camera, image, mask)
 
 
-def _single(camera: Camera) -> Camera:
-    return replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
-
-
-def _saved(folder: Path, name: str, view: Photograph, placement: Placement) -> dict[str, object]:
-    """What views.json says of a view, whose files are written."""
-    entry: dict[str, object] = {"image": f"images/{name}.png"}
-    save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
-    if view.mask is not None:
-        entry["mask"] = f"masks/{name}.png"
-        save_mask(folder / "masks" / f"{name}.png", view.mask)
-    double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
-    entry["intrinsics"] = view.camera.intrinsics.tolist()
-    return entry | {"T_world_camera": placement.camera_to_world(double).T_world_camera.tolist()}
-
-
 def _remarks(view: Photograph) -> list[str]:
     found: list[str] = []
     if (view.image == view.image[0, 0]).all():
         found.append("is of one colour all over; is its file whole?")
-    elif (white := (view.image >= 1).all(-1).float().mean()) > GLARE:
+    elif (white := (view.image >= 1).all(-1).float().mean()) > MAX_WHITE_SHARE:
         found.append(f"is fully white at {white:.0%} of its pixels; it is over-exposed, or nothing but background")
     if view.mask is not None and not view.mask.any():
         found.append("has a mask that marks no pixel as object")
     if view.mask is not None and view.mask.all():
         found.append("has a mask that marks every pixel as object")
-    if _place(view).norm() <= 1:
+    if view.camera.T_world_camera[:3, 3].norm() <= 1:
         found.append("was taken from within the unit sphere, where the object is; give a smaller unit_sphere")
-    elif not _sees(view.camera):
+    elif not view.camera.shows(*view.camera.project(view.camera.T_world_camera.new_zeros(3))):
         found.append("does not show the middle of the unit sphere; is its camera right?")
     return found
-
-
-def _place(view: Photograph) -> Float[Tensor, "3"]:
-    return view.camera.T_world_camera[:3, 3]
-
-
-def _sees(camera: Camera) -> bool:
-    pixel, depth = camera.project(camera.T_world_camera.new_zeros(3))
-    size = pixel.new_tensor([camera.width, camera.height])
-    return bool(depth > 0 and (pixel >= 0).all() and (pixel <= size).all())

@@ -11,9 +11,9 @@ from distrace.errors import explained
 from distrace.files import written
 
 FORMATS = ("PNG", "JPEG")
-PLAIN = ("L", "LA", "RGB", "RGBA")
-GREY = 0.1  # difference between the channels of a grey, at most
-DEEP = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
+EIGHT_BIT = ("L", "LA", "RGB", "RGBA")
+MAX_GREY_DIFFERENCE = 0.1  # difference between the channels of a grey, at most
+SIXTEEN_BIT = ("I;16", "I;16B", "I")  # Pillow's names for 16 bits of grey
 
 
 def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tensor, "height width"] | None]:
@@ -25,12 +25,10 @@ def read_picture(path: Path) -> tuple[Float[Tensor, "height width 3"], Bool[Tens
     levels = _levels(path)
     channels = levels.shape[-1]
     colour = levels[..., :3] if channels >= 3 else levels[..., :1].expand(-1, -1, 3)
-    return colour.contiguous(), _opaque(levels[..., -1]) if channels in (2, 4) else None
-
-
-def _opaque(alpha: Float[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """Where alpha is more than half, also if it is 0 and 1 in levels of 255."""
-    return alpha > min(0.5, max(alpha.max().item() / 2, 1e-6))
+    if channels not in (2, 4):
+        return colour.contiguous(), None
+    alpha = levels[..., -1]
+    return colour.contiguous(), alpha > min(0.5, max(alpha.max().item() / 2, 1e-6))  # alpha may be 0 and 1 of 255
 
 
 def read_mask(path: Path) -> Bool[Tensor, "height width"]:
@@ -44,7 +42,7 @@ def read_mask(path: Path) -> Bool[Tensor, "height width"]:
         return alpha
     level = colour.amax(-1)
     brightest = level.max().item()
-    grey = (level - colour.amin(-1)).max() < GREY
+    grey = (level - colour.amin(-1)).max() < MAX_GREY_DIFFERENCE
     if grey and 0 < brightest <= 0.5:
         raise ValueError(
             f"{path} is nowhere brighter than {255 * brightest:.0f} of 255; a mask is white where the object is, and"
@@ -78,11 +76,11 @@ def _levels(path: Path) -> Float[Tensor, "height width channels"]:
 
     with explained(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
-            full = 65535 if file.mode in DEEP else 255
-            plain = (
-                file if file.mode in (*PLAIN, *DEEP) else file.convert("RGBA" if file.has_transparency_data else "RGB")
-            )
-            levels = np.array(plain)
+            full = 65535 if file.mode in SIXTEEN_BIT else 255
+            if file.mode in (*EIGHT_BIT, *SIXTEEN_BIT):
+                levels = np.array(file)
+            else:
+                levels = np.array(file.convert("RGBA" if file.has_transparency_data else "RGB"))
     return torch.from_numpy(levels.astype(np.float32) / full).reshape(*levels.shape[:2], -1)
 
 

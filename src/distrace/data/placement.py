@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -10,27 +11,27 @@ from torch import Tensor
 
 from distrace.camera import Camera
 
-FEWEST = 20  # points that locate an object
-SHARE = 0.9  # of the points are within the sphere; the others are background and outliers
+MIN_POINTS = 20  # points that locate an object
+POINTS_INSIDE = 0.9  # of the points are within the sphere; the others are background and outliers
 MARGIN = 1.1
-MOST = 1e30  # largest coordinate
-PARALLEL = 1e-4  # of what the information on the worst known direction would be from all sides
-TELL = "tell where the object is as unit_sphere in views.json"
+MAX_COORDINATE = 1e30  # largest coordinate
+MIN_INFORMATION = 1e-4  # of what the information on the worst known direction would be from all sides
+ADVICE = "tell where the object is as unit_sphere in views.json"
 
 
 @dataclass(frozen=True)
 class Placement:
     """World = centre + radius · unit: centre and radius of the unit sphere, in the units of the folder's world."""
 
-    centre: Float[Tensor, "3"]
+    centre: Float[Tensor, "3"]  # in double: worlds may lie far from their origin
     radius: float
 
     def to_world(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        centre = self._centre(points)
+        centre = self.centre.to(points.device)
         return (centre + self.radius * points.to(centre.dtype)).to(points.dtype)
 
     def to_unit(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
-        centre = self._centre(points)
+        centre = self.centre.to(points.device)
         return ((points.to(centre.dtype) - centre) / self.radius).to(points.dtype)
 
     def camera_to_world(self, camera: Camera) -> Camera:
@@ -43,29 +44,26 @@ class Placement:
         """As `unit_sphere` has it, in views.json and in results."""
         return {"centre": self.centre.tolist(), "radius": self.radius}
 
-    def _centre(self, points: Tensor) -> Tensor:
-        # Worlds may lie far from their origin, so a centre in double is not rounded before it is subtracted.
-        return self.centre.to(points.device)
-
 
 def placement_of(centre: object, radius: object) -> Placement:
     """Raises `ValueError` where they are not three finite numbers and a positive one."""
-    numbers = isinstance(centre, list) and len(centre) == 3 and all(_finite(value) for value in centre)
-    if not numbers or not isinstance(radius, int | float) or not _finite(radius) or not radius > 0:
+    numbers: list[Any] = [*centre, radius] if isinstance(centre, list) else []
+    finite = all(isinstance(value, int | float) and abs(value) <= MAX_COORDINATE for value in numbers)
+    if len(numbers) != 4 or not finite or not numbers[3] > 0:
         raise ValueError(
             f"its centre is {centre} and its radius {radius}; three numbers and a positive one are needed, in the units"
             " of T_world_camera"
         )
-    return Placement(torch.tensor(centre, dtype=torch.float64), float(radius))
+    return Placement(torch.tensor(numbers[:3], dtype=torch.float64), float(numbers[3]))
 
 
 def among_points(points: Float[np.ndarray, "points 3"]) -> Placement | None:
     """The sphere around the median of points that holds nine in ten of them, and a margin; None for too few."""
-    if len(points) < FEWEST:
+    if len(points) < MIN_POINTS:
         return None
     positions = torch.from_numpy(points).double()
     centre = positions.median(0).values
-    radius = (positions - centre).norm(dim=-1).quantile(SHARE).item() * MARGIN
+    radius = (positions - centre).norm(dim=-1).quantile(POINTS_INSIDE).item() * MARGIN
     return Placement(centre, radius) if radius > 0 else None
 
 
@@ -93,16 +91,12 @@ def nearest_to_rays(origins: Float[Tensor, "views 3"], directions: Float[Tensor,
     Raises `ValueError` where they are parallel to about a degree, or the point is behind half of the origins.
     """
     across = torch.eye(3, dtype=origins.dtype) - directions[:, :, None] * directions[:, None]
-    if torch.linalg.eigvalsh(across.mean(0))[0] < PARALLEL:
-        raise ValueError(f"the {len(origins)} views look in one direction, so their axes meet nowhere; {TELL}")
+    if torch.linalg.eigvalsh(across.mean(0))[0] < MIN_INFORMATION:
+        raise ValueError(f"the {len(origins)} views look in one direction, so their axes meet nowhere; {ADVICE}")
     point = torch.linalg.solve(across.sum(0), (across @ origins[..., None]).sum(0))[:, 0]
     if ((point - origins) * directions).sum(-1).median() <= 0:
-        raise ValueError(f"the views look away from each other: their axes meet behind the cameras; {TELL}")
+        raise ValueError(f"the views look away from each other: their axes meet behind the cameras; {ADVICE}")
     return point
-
-
-def _finite(value: object) -> bool:
-    return isinstance(value, int | float) and abs(value) <= MOST
 
 
 def _moved(camera: Camera, place: Float[Tensor, "*batch 3"]) -> Camera:

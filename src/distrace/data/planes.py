@@ -7,8 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
-from distrace.data.catalogue import Mesh, listed
-from distrace.data.debian import by_hand, unpacked
+from distrace.data.debian import Mesh, by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -23,32 +22,28 @@ PARKED = "usr/share/games/flightgear/Scenery/Models/Aircraft"
 _TEXTURE = re.compile(r'^texture\s+"(?:[^"\n]*[/\\])?([^"\n]+)"', re.MULTILINE)
 
 
-def prepare(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """One mesh of each aircraft of the package, by `catalogue.listed`."""
-    return listed(PACKAGE, catalogue, out, deb)
-
-
 def catalogue(deb: Path, folder: Path) -> list[Mesh]:
-    """The mesh of each aircraft, by its folder's name: of several liveries or variants the one with most in it.
+    """Returns the mesh of each aircraft, by its folder's name: of several liveries or variants the largest file.
 
-    Raises ValueError if `deb` is missing, broken, or another package.
+    Raises `ValueError` if `deb` is missing, broken, or another package.
     """
     home = unpacked(PACKAGE, deb, folder, _arrange, "meshes and images", AIRCRAFT)
-    meshes = [_mesh(aircraft, folder) for aircraft in sorted(home.iterdir()) if _models(aircraft)]
+    meshes = []
+    for aircraft in sorted(home.iterdir()):
+        models = sorted(path for path in aircraft.rglob("*.ac") if path.parent.name not in PARTS)
+        if models:
+            largest = max(models, key=lambda path: path.stat().st_size)
+            category = "other" if aircraft.name in NO_PLANES else "plane"
+            meshes.append(Mesh(category, aircraft.name, CREATOR, LICENCE, PACKAGE, largest.relative_to(folder)))
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
     return meshes
 
 
-def prepare_parked(out: Path, deb: Path | None = None) -> list[Mesh]:
-    """The meshes of parked aircraft, and of what stands among them, by `catalogue.listed`."""
-    return listed(PARKED_PACKAGE, parked, out, deb)
-
-
 def parked(deb: Path, folder: Path) -> list[Mesh]:
-    """Each mesh by its file's name, helicopters, trailers and liveries among them: the split says what is learnt.
+    """Returns each mesh by its file's name, helicopters and liveries among them: the split says what is learnt.
 
-    Raises ValueError if `deb` is missing, broken, or another package.
+    Raises `ValueError` if `deb` is missing, broken, or another package.
     """
     home = unpacked(PARKED_PACKAGE, deb, folder, _arrange, "parked aircraft", PARKED)
     paths = [path.relative_to(folder) for path in sorted(home.glob("*.ac"))]
@@ -58,7 +53,7 @@ def parked(deb: Path, folder: Path) -> list[Mesh]:
 
 
 def _arrange(root: Path, home: Path) -> None:
-    """The meshes of `root`, each with the images that it names beside it; sounds and flight plans are left behind."""
+    """Takes the meshes of `root`, each with the images that it names beside it; sounds and flight plans are left."""
     for path in sorted(root.rglob("*.ac")):
         target = home / path.relative_to(root)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -68,7 +63,7 @@ def _arrange(root: Path, home: Path) -> None:
 
 
 def _images(mesh: Path, aircraft: Path) -> list[Path]:
-    """The files of a mesh's textures; of several liveries the default one, or the first."""
+    """Returns the files of a mesh's textures; of several liveries the default one, or the first."""
     named = sorted(set(_TEXTURE.findall(mesh.read_text(encoding="latin-1"))))
     files = [path for path in sorted(aircraft.rglob("*")) if path.is_file()]
     liveries = [[path for path in files if path.name == name] for name in named]
@@ -77,13 +72,3 @@ def _images(mesh: Path, aircraft: Path) -> list[Path]:
         return path.parent != mesh.parent, "default" not in path.parent.name.lower(), path
 
     return [min(paths, key=rank) for paths in liveries if paths]
-
-
-def _models(aircraft: Path) -> list[Path]:
-    return sorted(path for path in aircraft.rglob("*.ac") if path.parent.name not in PARTS)
-
-
-def _mesh(aircraft: Path, folder: Path) -> Mesh:
-    largest = max(_models(aircraft), key=lambda path: path.stat().st_size)
-    category = "other" if aircraft.name in NO_PLANES else "plane"
-    return Mesh(category, aircraft.name, CREATOR, LICENCE, PACKAGE, largest.relative_to(folder))

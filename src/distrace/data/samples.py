@@ -10,14 +10,14 @@ from distrace.data.solid import Solid, first_met
 from distrace.files import written
 from distrace.metrics import surface_points
 
-NEAR = 0.94  # the share of samples near the surface; the rest fills the unit sphere
+NEAR_SHARE = 0.94  # the share of samples near the surface; the rest fills the unit sphere
 VARIANCES = (0.0025, 0.00025, 0.000025)  # DeepSDF has the first two; the third is for thin legs and wings
-DOUBTFUL = 0.25  # a winding number this far from a whole number leaves the sign in doubt
-HOPELESS = 0.02  # a shape with a larger share of doubtful signs is not learnt
-HOLLOW = 0.3  # nor one of which a larger share of what is seen bounds no solid: cloth and cane drawn without thickness
-SHEET = 0.3  # nor one of which a larger share of the surface bounds nothing thicker than THIN
+MAX_WINDING_ERROR = 0.25  # a winding number this far from a whole number leaves the sign in doubt
+MAX_DOUBTFUL_SHARE = 0.02  # a shape with a larger share of doubtful signs is not learnt
+MAX_LOST_SHARE = 0.3  # nor one of which more of what is seen bounds no solid: cloth and cane without thickness
+MAX_THIN_SHARE = 0.3  # nor one of which a larger share of the surface bounds nothing thicker than THIN
 THIN = 0.002  # in which a mesh of 256 cells, each 0.008 wide, does not tell two sides apart, nor a network
-BEHIND = 0.02  # what is seen of the solid, if so far behind what is seen of the mesh, is something else
+LOST_DISTANCE = 0.02  # what is seen of the solid, if so far behind what is seen of the mesh, is something else
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Doubt:
         return self.name == name and rest and all(isinstance(share, int | float) for share in shares)
 
 
-def sample(solid: Solid, count: int, seed: int, near: float = NEAR) -> Float[np.ndarray, "count 4"]:
+def sample(solid: Solid, count: int, seed: int, near: float = NEAR_SHARE) -> Float[np.ndarray, "count 4"]:
     """Points and signed distances: most are displaced surface points, the rest fill the unit sphere."""
     random = np.random.default_rng(seed)
     surface = surface_points(solid.surface, int(near * count) // len(VARIANCES), seed)
@@ -53,13 +53,13 @@ def doubt(name: str, solid: Solid, count: int = 20_000) -> Doubt:
     """How reliable a shape's signs are, by winding numbers at random points in and around it."""
     points = np.random.default_rng(0).uniform(-1, 1, (count, 3)) * np.abs(solid.soup.bounds).max(0) * 1.05
     winding = solid.winding(points)
-    doubtful = float((np.abs(winding - np.round(winding)) > DOUBTFUL).mean())
+    doubtful = float((np.abs(winding - np.round(winding)) > MAX_WINDING_ERROR).mean())
     outer = float(solid.surface.area / solid.soup.area)
     missing = lost(solid)
     sheet = thin(solid)
-    reasons = [f"{doubtful:.1%} of its signs are doubtful"] if doubtful > HOPELESS else []
-    reasons += [f"{missing:.0%} of what is seen of it bounds no solid"] if missing > HOLLOW else []
-    reasons += [f"{sheet:.0%} of its surface bounds nothing thicker than {THIN:g}"] if sheet > SHEET else []
+    reasons = [f"{doubtful:.1%} of its signs are doubtful"] if doubtful > MAX_DOUBTFUL_SHARE else []
+    reasons += [f"{missing:.0%} of what is seen of it bounds no solid"] if missing > MAX_LOST_SHARE else []
+    reasons += [f"{sheet:.0%} of its surface bounds nothing thicker than {THIN:g}"] if sheet > MAX_THIN_SHARE else []
     return Doubt(name, len(solid.soup.faces), outer, doubtful, not reasons, " and ".join(reasons), missing, sheet)
 
 
@@ -71,7 +71,7 @@ def lost(solid: Solid, count: int = 5000) -> float:
     origins = _in_ball(random, count) - 2 * directions
     of_soup, of_solid = (first_met(mesh, origins, directions) for mesh in (solid.soup, solid.surface))
     met = np.isfinite(of_soup)
-    return float((of_solid[met] > of_soup[met] + BEHIND).mean()) if met.any() else 0.0
+    return float((of_solid[met] > of_soup[met] + LOST_DISTANCE).mean()) if met.any() else 0.0
 
 
 def thin(solid: Solid, count: int = 5000) -> float:

@@ -47,13 +47,13 @@ class Job:
 
 
 def jobs(shapes: list[Shape], meshes: Path, out: Path, count: int, mirror: bool, variants: int) -> list[Job]:
-    """The shapes to sample; only those to train on have variants."""
-
-    def job(shape: Shape) -> Job:
+    """Returns the shapes to sample; only those to train on have variants."""
+    found = []
+    for shape in shapes:
         learnt = shape.split == "train"
-        return Job(shape, meshes / shape.path, out, count, mirror and learnt, variants if learnt else 0)
-
-    return [job(shape) for shape in shapes if shape.split != "out"]
+        if shape.split != "out":
+            found.append(Job(shape, meshes / shape.path, out, count, mirror and learnt, variants if learnt else 0))
+    return found
 
 
 def run(todo: list[Job], workers: int) -> Iterator[Doubt]:

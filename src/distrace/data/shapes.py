@@ -46,7 +46,7 @@ def read_split(source: str | Path) -> list[Shape]:
     with explained(f"the split {source} cannot be read: each row needs all of its columns, and degrees as its turn"):
         shapes = [_shape(row) for row in rows]
     with about(f"the split {source}"):
-        return _apart(shapes)
+        return _checked_names(shapes)
 
 
 def _shape(row: dict[str, str]) -> Shape:
@@ -59,8 +59,8 @@ def _shape(row: dict[str, str]) -> Shape:
     return shape
 
 
-def _apart(shapes: list[Shape]) -> list[Shape]:
-    """The shapes, whose names are those of files in one folder beside the run's `result.json`."""
+def _checked_names(shapes: list[Shape]) -> list[Shape]:
+    """Returns the shapes. Raises `ValueError` where their names cannot be files in one folder, beside `result.json`."""
     for name, count in Counter(shape.name for shape in shapes).items():
         if count > 1:
             paths = ", ".join(shape.path for shape in shapes if shape.name == name)
@@ -68,11 +68,6 @@ def _apart(shapes: list[Shape]) -> list[Shape]:
         if name != Path(name).name or "\\" in name or name in ("", "..", "result"):
             raise ValueError(f"a shape is called {name!r}, which cannot name its files; rename it")
     return shapes
-
-
-def on_side(side: str, split: str | Path) -> list[Shape]:
-    """Those of a split on its side `train` or `test`."""
-    return [shape for shape in read_split(split) if shape.split == side]
 
 
 def every_mesh(folder: Path) -> list[Shape]:
@@ -85,7 +80,7 @@ def every_mesh(folder: Path) -> list[Shape]:
         raise ValueError(f"{folder} holds no mesh; files ending in {', '.join(MESH_SUFFIXES)} are looked for")
     names = ["-".join(path.with_suffix("").parts) for path in paths]
     with about(folder):
-        return _apart([Shape(name, "train", name, 0.0, str(path), "", "") for name, path in zip(names, paths)])
+        return _checked_names([Shape(name, "train", name, 0.0, str(path), "", "") for name, path in zip(names, paths)])
 
 
 def has_meshes(folder: Path) -> bool:

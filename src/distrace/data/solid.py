@@ -6,14 +6,13 @@ Barill et al., SIGGRAPH 2018); its surface is the part of the soup across which 
 """
 
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from distrace.data.ac3d import load_ac3d
+from distrace.data.mesh_files import load_soup, mesh_of
 from distrace.data.shapes import Shape
 from distrace.errors import explained
 from distrace.optional import require
@@ -23,10 +22,9 @@ if TYPE_CHECKING:
 
 RADIUS = 1 / 1.03  # of the largest vertex, as DeepSDF's preprocessing has it (Park et al. 2019, supplementary B)
 OFFSET = 3e-4  # distance from a face at which its two sides are tested
-SPACING = 0.02  # between the test points of one face
-LEAST_VOLUME = 1e-9  # of a closed part that has an inside
-OPEN = 0.15  # of a part's area: larger holes make it a sheet
-ASCII = bytes(range(128)) + b"?" * 128  # what each byte becomes
+TEST_SPACING = 0.02  # between the test points of one face
+MIN_VOLUME = 1e-9  # of a closed part that has an inside
+MAX_OPEN_SHARE = 0.15  # of a part's area: larger holes make it a sheet
 PURPOSE = "telling a mesh's inside from its outside"  # libigl's winding numbers
 SMALLEST = 0.01  # faces partly inside are split until their edges are this short
 
@@ -76,45 +74,6 @@ def solid_of(shape: Shape, meshes: Path) -> Solid:
     return turned(load_solid(mesh_of(shape, meshes)), shape.turn)
 
 
-def mesh_of(shape: Shape, meshes: Path) -> Path:
-    """Its file, in a catalogue's folder, `meshes` or one below. Raises `ValueError` where it is missing."""
-    for path in (meshes / shape.path, *sorted(meshes.glob(f"*/{shape.path}"))):
-        if path.is_file():
-            return path
-    raise ValueError(f"{meshes / shape.path} is missing; `distrace data furniture` and `… planes` fetch the meshes")
-
-
-def load_soup(path: Path) -> "trimesh.Trimesh":
-    """All triangles of a file, as they are."""
-    import trimesh
-
-    if path.suffix.lower() == ".ac":  # trimesh does not know AC3D
-        corners = load_ac3d(path)
-        return trimesh.Trimesh(corners.reshape(-1, 3), np.arange(3 * len(corners)).reshape(-1, 3), process=False)
-    mesh = load_geometry(path, force="mesh", skip_materials=True)
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-
-
-def load_geometry(path: Path, **options: Any) -> Any:
-    """The mesh, scene or cloud of points that trimesh reads from a file, unmerged.
-
-    Bytes of names and comments that are not ASCII become question marks: trimesh takes only UTF-8.
-    """
-    import trimesh
-
-    kind = path.suffix.lower().removeprefix(".")
-    if kind not in ("obj", "off", "stl", "ply"):
-        return trimesh.load(path, process=False, **options)
-    content = path.read_bytes()
-    text = len(content)
-    if kind == "stl" and text == 84 + 50 * int.from_bytes(content[80:84], "little"):
-        text = 0  # binary: trimesh ignores its header
-    elif kind == "ply" and b"format ascii" not in content[:1000]:
-        text = content.find(b"end_header")
-    content = content[:text].translate(ASCII) + content[text:]
-    return trimesh.load(BytesIO(content), file_type=kind, process=False, **options)
-
-
 def turned(solid: Solid, degrees: float) -> Solid:
     """The solid rotated about the y axis."""
     matrix = turn_matrix(degrees)
@@ -161,7 +120,7 @@ def oriented(soup: "trimesh.Trimesh") -> "trimesh.Trimesh":
     if volume.sum() < 0:
         faces = faces[:, ::-1]
         volume = -volume
-    inwards = (closed & (volume < -LEAST_VOLUME))[part]
+    inwards = (closed & (volume < -MIN_VOLUME))[part]
     mesh = trimesh.Trimesh(soup.vertices, faces, process=False)
     if inwards.any():
         outside = mesh.triangles_center[inwards] - OFFSET * mesh.face_normals[inwards]
@@ -192,7 +151,7 @@ def _parts(soup: "trimesh.Trimesh") -> tuple[np.ndarray, np.ndarray, np.ndarray]
     centre = integral(soup.triangles_center) / area[:, None]
     heights = ((soup.triangles_center - centre[part]) * soup.face_normals).sum(1)
     volume = np.bincount(part, heights * soup.area_faces / 3)
-    return part, volume, np.linalg.norm(integral(soup.face_normals), axis=1) < OPEN * area
+    return part, volume, np.linalg.norm(integral(soup.face_normals), axis=1) < MAX_OPEN_SHARE * area
 
 
 def first_met(
@@ -232,7 +191,7 @@ def _exposure(soup: "trimesh.Trimesh", triangles: np.ndarray) -> tuple[np.ndarra
     """Of each triangle, the share of test points with the solid on one side only, and whether its normal points out."""
     cross = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     doubled_area = np.linalg.norm(cross, axis=1)
-    tests = np.clip(np.ceil(doubled_area / 2 / SPACING**2), 3, 500).astype(int)
+    tests = np.clip(np.ceil(doubled_area / 2 / TEST_SPACING**2), 3, 500).astype(int)
     face = np.repeat(np.arange(len(triangles)), tests)
     points = np.einsum("nk,nkd->nd", _spread(tests), triangles[face])
     normals = (cross / doubled_area[:, None])[face]

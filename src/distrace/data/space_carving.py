@@ -11,16 +11,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.placement import TELL, Placement, nearest_to_rays, origins_of
+from distrace.data.placement import ADVICE, Placement, nearest_to_rays, origins_of
 from distrace.pixels import thinned
 
 CELLS = 40  # along each axis
 ROUNDS = 3
-START = 1.5  # radii: what surely holds the object
+START_FACTOR = 1.5  # radii: what surely holds the object
 MARGIN = 1.03
-AGREE = 0.9  # of the masks that see a place: one in ten may be wrong
-MOST = 20_000  # pixels of a mask that are looked at for the start
-SEEN = 0.5  # of the views, at least, see what is the object
+MIN_MASKS_AGREEING = 0.9  # of the masks that see a place: one in ten may be wrong
+MAX_PIXELS = 20_000  # pixels of a mask that are looked at for the start
+MIN_VIEWS_SEEING = 0.5  # of the views, at least, see what is the object
 
 
 def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]) -> Placement:
@@ -34,7 +34,7 @@ def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]
         if not len(places):
             raise ValueError(
                 f"nothing lies within the masks of {len(masks)} views together; are they inverted, or the cameras"
-                f" others? If they are right, {TELL}"
+                f" others? If they are right, {ADVICE}"
             )
         sphere = _smallest(places)
     return Placement(sphere.centre, MARGIN * sphere.radius)
@@ -42,7 +42,7 @@ def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]
 
 def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
     """About where the rays of the masks' middles meet, as large as the mask that reaches farthest from there."""
-    seen = [camera.rays(camera.pixels()[thinned(mask, MOST)]).directions for camera, mask in zip(cameras, masks)]
+    seen = [camera.rays(camera.pixels()[thinned(mask, MAX_PIXELS)]).directions for camera, mask in zip(cameras, masks)]
     middles = torch.stack([directions.mean(0) for directions in seen]).double()
     origins = origins_of(cameras)
     centre = nearest_to_rays(origins, middles / middles.norm(dim=-1, keepdim=True))
@@ -51,7 +51,7 @@ def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
         towards = centre - origin
         cosine = (directions.double() @ towards / towards.norm()).min().clamp(0, 1)
         radius = max(radius, (towards.norm() * (1 - cosine**2).sqrt()).item())
-    return Placement(centre, START * radius)
+    return Placement(centre, START_FACTOR * radius)
 
 
 def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Float[Tensor, "places 3"]:
@@ -65,7 +65,7 @@ def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor
         inside, hit = _near(camera, mask, places, reach, sphere.centre)
         seen += inside
         allowed += hit
-    return places[(seen >= SEEN * len(cameras)) & (allowed >= AGREE * seen)]
+    return places[(seen >= MIN_VIEWS_SEEING * len(cameras)) & (allowed >= MIN_MASKS_AGREEING * seen)]
 
 
 def _near(

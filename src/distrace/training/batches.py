@@ -14,31 +14,9 @@ from torch import Tensor
 from distrace.checkpoints.model import VARIANT
 from distrace.errors import DoubtfulResult, about, explained
 
-NEAREST = 0.012  # median distance from the origin of samples of a shape in the unit sphere, at least …
-AWAY = 1.2  # … and at most
-FARTHEST = 4.0  # distance of a sample from such a shape
-
-Batch = tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]
-"""Numbers of shapes, and samples of each: as many outside as inside."""
-
-
-@dataclass(frozen=True)
-class Side:
-    """The samples of all shapes on one side of their surfaces, concatenated so that one gather draws a batch."""
-
-    samples: Float[Tensor, "n 4"]
-    begins: Int[Tensor, "shapes"]
-    counts: Int[Tensor, "shapes"]
-
-    @staticmethod
-    def of(parts: list[Float[Tensor, "_ 4"]]) -> "Side":
-        counts = torch.tensor([len(part) for part in parts])
-        return Side(torch.cat(parts), counts.cumsum(0) - counts, counts)
-
-    def drawn(self, shapes: Int[Tensor, "chosen"], number: int) -> Float[Tensor, "chosen number 4"]:
-        """`number` random samples of each of the shapes."""
-        places = (torch.rand(len(shapes), number, dtype=torch.float64) * self.counts[shapes, None]).long()
-        return self.samples[(self.begins[shapes, None] + places).to(self.samples.device)]
+MIN_MEDIAN_RADIUS = 0.012  # median distance from the origin of samples of a shape in the unit sphere, at least …
+MAX_MEDIAN_RADIUS = 1.2  # … and at most
+MAX_DISTANCE = 4.0  # distance of a sample from such a shape
 
 
 @dataclass(frozen=True)
@@ -50,18 +28,30 @@ class Samples:
     inside: list[Float[Tensor, "_ 4"]]
 
     @cached_property
-    def sides(self) -> tuple[Side, Side]:
-        return Side.of(self.outside), Side.of(self.inside)
+    def sides(self) -> list[tuple[Float[Tensor, "_ 4"], Int[Tensor, "shapes"]]]:
+        """Outside and inside: the samples of all shapes, concatenated for a single gather, and their counts."""
+        sides = (self.outside, self.inside)
+        return [(torch.cat(parts), torch.tensor([len(part) for part in parts])) for parts in sides]
 
     @cached_property
     def variant(self) -> Bool[Tensor, "shapes"]:
         return torch.tensor([VARIANT in name for name in self.names])
 
-    def drawn(self, shapes: int, samples: int, variants: float) -> Batch:
-        """A batch of `samples` from `shapes` random shapes; variants are drawn with the weight `variants`."""
+    def drawn(
+        self, shapes: int, samples: int, variants: float
+    ) -> tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]:
+        """Returns the numbers of random shapes, and `samples` of them in all: as many outside as inside.
+
+        Variants are drawn with the weight `variants`, other shapes with 1.
+        """
         chosen = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
         per_side = max(samples // len(chosen) // 2, 1)
-        return chosen, torch.cat([side.drawn(chosen, per_side) for side in self.sides], dim=1)
+        drawn = []
+        for side, counts in self.sides:
+            begins = counts.cumsum(0) - counts
+            places = (torch.rand(len(chosen), per_side, dtype=torch.float64) * counts[chosen, None]).long()
+            drawn.append(side[(begins[chosen, None] + places).to(side.device)])
+        return chosen, torch.cat(drawn, dim=1)
 
     def to(self, device: torch.device) -> "Samples":
         return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
@@ -116,7 +106,7 @@ def _check_sides(pos: Float[np.ndarray, "_ 4"], neg: Float[np.ndarray, "_ 4"]) -
     samples = np.concatenate([pos, neg])
     away = float(np.median(np.linalg.norm(samples[:, :3], axis=1)))
     farthest = float(np.abs(samples[:, 3]).max())
-    if not NEAREST < away < AWAY or farthest > FARTHEST:
+    if not MIN_MEDIAN_RADIUS < away < MAX_MEDIAN_RADIUS or farthest > MAX_DISTANCE:
         raise ValueError(
             f"its points lie {away:.3g} from the origin in the median, and up to {farthest:.3g} from the surface, but"
             " the shape must be in the unit sphere: divide by its largest radius"

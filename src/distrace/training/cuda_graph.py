@@ -8,7 +8,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-PLAIN = 3  # warm-up calls before the capture: libraries allocate their workspaces in them
+WARM_UP_CALLS = 3  # warm-up calls before the capture: libraries allocate their workspaces in them
 
 
 class Recorded:
@@ -27,7 +27,7 @@ class Recorded:
     def __call__(self, *inputs: Tensor) -> Tensor:
         """The function's result; valid until the next call."""
         self.calls += 1
-        if self.calls <= PLAIN:
+        if self.calls <= WARM_UP_CALLS:
             return self._warm_up(inputs)
         if not self.inputs:
             self.inputs = tuple(each.clone() for each in inputs)

@@ -15,7 +15,7 @@ from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.training.batches import Samples
 from distrace.training.config import TrainConfig
 from distrace.training.cuda_graph import Recorded
-from distrace.training.distillation import Kept
+from distrace.training.fine_tuning import Kept
 from distrace.training.losses import clamped_loss, record, training_loss
 
 
@@ -28,11 +28,6 @@ class Training:
     optimiser: torch.optim.Adam
     step: int = 0
     losses: list[float] = field(default_factory=list)  # the mean of each COURSE steps so far; the last may have fewer
-
-    def record(self, loss: float) -> None:
-        """Counts a step done."""
-        record(self.losses, self.step, loss)
-        self.step += 1
 
 
 @dataclass(frozen=True)
@@ -80,12 +75,13 @@ def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept 
         step = Recorded(step)
     while training.step < config.steps:
         began = time.perf_counter()
-        share = _rate(training.step, config)
-        _set_rates(training.optimiser, (share * config.learning_rate, share * config.code_learning_rate))
+        _set_rates(training, config)
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = samples.drawn(config.shapes_per_step, config.samples_per_step, config.variant_weight)
         between = () if kept is None else (kept.drawn(shapes),)
-        training.record(loss := step(shapes.to(device), batch, *between).item())
+        loss = step(shapes.to(device), batch, *between).item()
+        record(training.losses, training.step, loss)
+        training.step += 1
         yield Step(training.step, loss, time.perf_counter() - began)
 
 
@@ -123,8 +119,12 @@ def _prepare(optimiser: torch.optim.Adam, device: torch.device) -> None:
         group["lr"] = torch.zeros((), device=device) if recorded else 0.0
 
 
-def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
-    for group, rate in zip(optimiser.param_groups, rates, strict=True):
+def _set_rates(training: Training, config: TrainConfig) -> None:
+    """Sets the step's learning rates: a trapezium, which can be prolonged (Hägele et al., NeurIPS 2024)."""
+    left = (config.steps - training.step) / (config.steps * config.cool_down)
+    share = min(1.0, (training.step + 1) / config.warm_up, left)
+    rates = (share * config.learning_rate, share * config.code_learning_rate)
+    for group, rate in zip(training.optimiser.param_groups, rates, strict=True):
         if isinstance(group["lr"], Tensor):
             group["lr"].fill_(rate)  # a CUDA graph reads it from this address
         else:
@@ -135,12 +135,6 @@ def _set_rates(optimiser: torch.optim.Adam, rates: tuple[float, float]) -> None:
 def bound_codes(codes: Tensor, bound: float) -> None:
     """Scales codes that are longer than the bound back to it."""
     codes.mul_((bound / codes.norm(dim=-1, keepdim=True).clamp_min(1e-12)).clamp_max(1.0))
-
-
-def _rate(step: int, config: TrainConfig) -> float:
-    """The factor of the learning rate at a step: a trapezium, which can be prolonged (Hägele et al., NeurIPS 2024)."""
-    left = (config.steps - step) / (config.steps * config.cool_down)
-    return min(1.0, (step + 1) / config.warm_up, left)
 
 
 def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:

@@ -15,7 +15,7 @@ from distrace.errors import DoubtfulResult, about, explained
 from distrace.optional import require
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
-OBSERVED = 3  # images at least that see a point which is trusted
+MIN_TRACK_LENGTH = 3  # images at least that see a point which is trusted
 
 
 def read(folder: Path) -> Shots | None:
@@ -95,5 +95,5 @@ def _mask(masks: Path, name: str) -> Path | None:
 
 
 def _points(found: Any) -> Float[np.ndarray, "points 3"]:
-    points = [point.xyz for point in found.points3D.values() if point.track.length() >= OBSERVED]
+    points = [point.xyz for point in found.points3D.values() if point.track.length() >= MIN_TRACK_LENGTH]
     return np.array(points, np.float64).reshape(-1, 3)

@@ -8,7 +8,7 @@ import numpy as np
 
 from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, file_of, listed, matrix, read_json
 from distrace.data.pictures import picture_size
-from distrace.data.placement import MOST
+from distrace.data.placement import MAX_COORDINATE
 from distrace.errors import about
 
 NAMES = ("transforms.json", "transforms_train.json")
@@ -86,6 +86,6 @@ def _positive(entry: dict[str, Any], name: str, below: float) -> float:
 
 def _number(entry: dict[str, Any], name: str) -> float:
     value = entry[name]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST:
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_COORDINATE:
         raise ValueError(f"{name} is {value!r}; a number is needed")
     return float(value)
