@@ -1,4 +1,4 @@
-"""Residuals of a placed shape before photographs: colours that differ between views, and wrong silhouettes.
+"""The least-squares problem of a placed shape before photographs: residuals, and their Jacobian.
 
 A surface point that one view sees is looked up in others (Liu et al., CVPR 2020, section 3.4; Lin et al., *Photometric
 Mesh Optimization*, CVPR 2019). Its derivatives are exact: by the implicit function theorem the point slides along its
@@ -23,13 +23,11 @@ from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
-RESTART_MARGIN = 0.05  # radii before its last hit at which a ray's next trace starts
-NEAR_MISS = 0.03  # background rays that come closer than this to the surface get their least value searched
-LEAST_SLOPE = 0.2  # bound on |∇f · v|, so that points at grazing rays do not slide too far
-OUTLINE_SATURATION = 3.0  # × the outline scale: residuals beyond it hardly pull
-MINIMUM_REACH = 0.05  # radii, and …
-MINIMUM_ROUNDS = 2  # … rounds, of the search for a ray's least value
-PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # of rotation, translation and log scale: radians, radii, 1
+RESTART_MARGIN = 0.05  # radii before its last hit at which a ray's next trace starts: steps move the surface less
+NEAR_MISS = 0.03  # radii: background rays that come closer to the surface get their least value searched
+LEAST_SLOPE = 0.2  # of |∇f · v|: at grazing rays points slide farther than the linearisation holds
+OUTLINE_SATURATION = 3.0  # × the outline scale: beyond it a label is wrong rather than the shape
+PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # prior: rotation (radians), translation (radii), log scale
 MARCH = TraceConfig(tolerance=1e-3, steps=50, least_step=2e-3)
 
 
@@ -116,7 +114,7 @@ class PhotoProblem:
         background = (bounds.meets & ~trace.hit & (label < 0)).nonzero()[:, 0]
         wrong[background] = sdf(rays[background].at(distance[background])) < NEAR_MISS
         within = Bounds(bounds.near[wrong], bounds.far[wrong])
-        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=MINIMUM_REACH, refine=MINIMUM_ROUNDS)
+        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=RESTART_MARGIN, refine=2)
         self.evaluations += sdf.evaluations
         return TracedShape(shape, distance, trace.hit, wrong)
 
@@ -129,19 +127,22 @@ class PhotoProblem:
 
     def residuals(self, state: TracedShape) -> Residuals:
         """Colour differences, field values at wrong silhouettes, and the prior's residuals, in this order."""
-        rows = torch.cat([self.pairs[:, 0].unique(), state.wrong.nonzero()[:, 0]]).unique()
+        rows = torch.cat([self.pairs[:, 0], state.wrong.nonzero()[:, 0]]).unique()
         points = self._linearise(state, rows)
         parts = [self._colours(state, points), self._outlines(state, points), self._prior(state)]
-        return Residuals(*(torch.cat(part) for part in zip(*((p.values, p.jacobian, p.weights) for p in parts))))
+        return Residuals(
+            torch.cat([part.values for part in parts]),
+            torch.cat([part.jacobian for part in parts]),
+            torch.cat([part.weights for part in parts]),
+        )
 
     def terms(self, state: TracedShape, residuals: Residuals) -> dict[str, float]:
         """The robust loss of each kind of residual."""
+        losses = residuals.weights * charbonnier(residuals.values.square())[0] / 2
         colours = 3 * len(self.pairs)
-        outlines = int(state.wrong.sum())
-        sizes = [colours, outlines, len(residuals.values) - colours - outlines]
-        parts = zip(*(each.split(sizes) for each in (residuals.values, residuals.jacobian, residuals.weights)))
-        losses = [Residuals(*part).loss(1.0, charbonnier) for part in parts]
-        return dict(zip(("colour", "outline", "code"), losses, strict=True))
+        outlines = colours + int(state.wrong.sum())
+        parts = {"colour": losses[:colours], "outline": losses[colours:outlines], "code": losses[outlines:]}
+        return {name: float(part.sum()) for name, part in parts.items()}
 
     def _linearise(self, state: TracedShape, rows: Int[Tensor, "rays"]) -> "_SurfacePoints":
         """Points on some rays, with the field's values and derivatives."""

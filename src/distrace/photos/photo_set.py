@@ -1,4 +1,4 @@
-"""One level of the pyramid of photographs: sampled rays, labels of their pixels, and the views that see each point."""
+"""Photographs prepared for a fit: which rays are compared, what their pixels show, and which views see each point."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,9 +12,9 @@ from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
 from distrace.fitting.ray_sampling import drawn
 from distrace.photos.colour_segmentation import ColourModel, appearance
-from distrace.photos.residuals import MARCH, ComparisonConfig, PhotoProblem, PlacedShape, RayObservations, TracedShape
+from distrace.photos.problem import MARCH, ComparisonConfig, PhotoProblem, PlacedShape, RayObservations, TracedShape
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
-from distrace.photos.visual_hull import CrossViewConsistency
+from distrace.photos.visual_hull import Masks, consistent_silhouettes
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
@@ -24,7 +24,7 @@ from distrace.tracing.sphere_tracing import Trace, sphere_trace
 OCCLUSION_START = 0.03  # radii from a surface point at which the search for an occluder starts
 LEAST_COSINE = 0.2  # between a normal and the direction to another view that sees the point
 LEAST_CERTAINTY = 0.3  # below it a pixel's label is unknown
-NEAR_SURFACE = 0.1  # background rays whose least value is larger are left out
+NEAR_SURFACE = 0.1  # radii: background rays whose least value is larger are left out
 
 Labels = Sequence[Float[Tensor, "height width"]]
 """Each view's certainty that a pixel shows the object, up to 1, or the background, down to −1; 0 where unknown."""
@@ -34,8 +34,6 @@ Labels = Sequence[Float[Tensor, "height width"]]
 class SampledRays:
     """Rays of all views, view by view, with a shape traced along them."""
 
-    decoder: Decoder
-    prior: Prior
     shape: PlacedShape
     sdf: Counted
     view: Int[Tensor, "n"]
@@ -44,36 +42,43 @@ class SampledRays:
     rays_object: Rays
     trace: Trace
 
+    def read(self, images: Sequence[Float[Tensor, "height width channels"]]) -> Float[Tensor, "n channels"]:
+        """The images' values, one image a view, at the rays' pixels."""
+        flat = [image.flatten(0, 1)[self.pixel[self.view == view]] for view, image in enumerate(images)]
+        return torch.cat(flat)
+
 
 @dataclass(frozen=True)
-class PyramidLevel:
-    """Photographs at one level of the pyramid."""
+class PhotoSet:
+    """Photographs, and the model whose shapes are compared with them."""
 
+    decoder: Decoder
+    prior: Prior
+    config: ComparisonConfig
     photographs: Sequence[Photograph]
     images: Sequence[GradientImage]  # the colours that are compared
     neighbours: Int[Tensor, "views count"]  # −1 where there are fewer
     appearances: Sequence[Float[Tensor, "height width 4"]]  # for the segmentation
     meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
-    consistency: CrossViewConsistency
 
     @staticmethod
-    def of(photographs: Sequence[Photograph], factor: float, config: ComparisonConfig) -> "PyramidLevel":
-        """The level of photographs whose size is × `factor`."""
-        coarse = [photograph.resized(factor) for photograph in photographs]
-        cameras = [each.camera for each in coarse]
-        images = [
-            GradientImage.of(each.image if config.same_light else normalise_light(each.image), each.camera)
-            for each in coarse
-        ]
-        neighbours = neighbour_views(cameras, config.neighbours)
-        appearances = [appearance(each.image) for each in coarse]
-        meets = [meet_sphere(camera.rays()).meets.reshape(-1) for camera in cameras]
-        return PyramidLevel(coarse, images, neighbours, appearances, meets, CrossViewConsistency.of(cameras))
+    def of(decoder: Decoder, photographs: Sequence[Photograph], prior: Prior, config: ComparisonConfig) -> "PhotoSet":
+        """Prepares photographs whose cameras see the unit sphere."""
+        colours = [each.image if config.same_light else normalise_light(each.image) for each in photographs]
+        cameras = [each.camera for each in photographs]
+        return PhotoSet(
+            decoder,
+            prior,
+            config,
+            photographs,
+            [GradientImage.of(colour, camera) for colour, camera in zip(colours, cameras, strict=True)],
+            neighbour_views(cameras, config.neighbours),
+            [appearance(each.image) for each in photographs],
+            [meet_sphere(camera.rays()).meets.reshape(-1) for camera in cameras],
+        )
 
     @torch.no_grad()
-    def sample(
-        self, decoder: Decoder, prior: Prior, shape: PlacedShape, rays: int, random: torch.Generator
-    ) -> SampledRays:
+    def sample(self, shape: PlacedShape, rays: int, random: torch.Generator) -> SampledRays:
         """Draws rays that meet the unit sphere, as many from each view, and traces a shape along them."""
         share = -(-rays // len(self.photographs))
         chosen = [drawn(meets.nonzero()[:, 0], share, random) for meets in self.meets]
@@ -84,29 +89,26 @@ class PyramidLevel:
         ]
         rays_world = Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
         rays_object = shape.place.rays_in_object(rays_world)
-        sdf = Counted(decoder.field(prior.code(shape.w)))
+        sdf = Counted(self.decoder.field(self.prior.code(shape.w)))
         trace = sphere_trace(sdf, rays_object, meet_sphere(rays_object), MARCH)
-        return SampledRays(decoder, prior, shape, sdf, view, torch.cat(chosen), rays_world, rays_object, trace)
+        return SampledRays(shape, sdf, view, torch.cat(chosen), rays_world, rays_object, trace)
 
     @torch.no_grad()
-    def problem(
-        self, sample: SampledRays, config: ComparisonConfig, labels: Labels | None = None
-    ) -> tuple[PhotoProblem, TracedShape]:
-        """The residuals on sampled rays, and the shape's state; `labels` are by default the shape's own."""
+    def problem(self, sample: SampledRays, labels: Labels | None = None) -> tuple[PhotoProblem, TracedShape]:
+        """The problem on sampled rays, and the shape's state; `labels` are by default the shape's own."""
         shape = sample.shape
         trace = sample.trace
-        colour = _read(sample, [each.channels[:3].permute(1, 2, 0) for each in self.images])
-        label = _read(sample, [each[..., None] for each in labels or self.labels(sample)])[:, 0]
+        colour = sample.read([image.channels[:3].permute(1, 2, 0) for image in self.images])
+        label = sample.read([label[..., None] for label in labels or self.labels(sample)])[:, 0]
         least = sample.sdf(sample.rays_object.at(trace.closest.nan_to_num(posinf=0.0)))
-        far = ~trace.hit & (least > NEAR_SURFACE)
-        kept = (trace.hit | (label > 0) | (label < 0) & ~far).nonzero()[:, 0]
-        observations = RayObservations(sample.rays_world, sample.view, colour, label)[kept]
-        trace = trace[kept]
+        used = (trace.hit | (label > 0) | (label < 0) & (least < NEAR_SURFACE)).nonzero()[:, 0]
+        observations = RayObservations(sample.rays_world, sample.view, colour, label)[used]
+        trace = trace[used]
         compared = (trace.hit & (observations.label >= 0)).nonzero()[:, 0]
-        points = sample.rays_object[kept][compared].at(trace.distance[compared])
+        points = sample.rays_object[used][compared].at(trace.distance[compared])
         rows, neighbours = self._visible(observations.view[compared], shape.place, points, sample.sdf)
         pairs = torch.stack([compared[rows], neighbours], dim=1)
-        problem = PhotoProblem(sample.decoder, sample.prior, observations, self.images, pairs, config, shape.place)
+        problem = PhotoProblem(self.decoder, self.prior, observations, self.images, pairs, self.config, shape.place)
         problem.evaluations = sample.sdf.evaluations
         return problem, problem.trace(shape, TracedShape(shape, trace.closest, trace.hit, trace.hit))
 
@@ -116,19 +118,33 @@ class PyramidLevel:
 
         Pixels that look like the object where most other views rule it out are unknown.
         """
-        looks = _read(sample, self.appearances)
+        masks = [2.0 * each.mask - 1 for each in self.photographs if each.mask is not None]
+        if len(masks) == len(self.photographs):
+            return masks
         hit = sample.trace.hit
-        outside = [looks.reshape(-1, 4)[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
-        background = torch.cat([looks[~hit], *outside])
+        seen = sample.read(self.appearances)
+        outside = [looks.flatten(0, 1)[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
+        background = torch.cat([seen[~hit], *outside])
         is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
-        model = ColourModel.of(torch.cat([looks[hit], background]), is_object)
+        model = ColourModel.of(torch.cat([seen[hit], background]), is_object)
         certainties = [2 * model.smooth_probability(looks) - 1 for looks in self.appearances]
-        silhouettes = self.consistency.silhouettes([certainty > 0 for certainty in certainties])
+        cameras = [photograph.camera for photograph in self.photographs]
+        silhouettes = consistent_silhouettes(cameras, [certainty > 0 for certainty in certainties])
         return [
             2.0 * photograph.mask - 1
             if photograph.mask is not None
             else certainty.masked_fill((certainty > 0) & ~silhouette | (certainty.abs() < LEAST_CERTAINTY), 0.0)
             for photograph, certainty, silhouette in zip(self.photographs, certainties, silhouettes, strict=True)
+        ]
+
+    def object_masks(self) -> Masks:
+        """The masks or, without them, the pixels whose appearance is rare where rays miss the unit sphere."""
+        model = ColourModel.of(torch.cat([looks.flatten(0, 1) for looks in self.appearances]), torch.cat([*self.meets]))
+        return [
+            (model.smooth_probability(looks) > 0.6) & meets.reshape(looks.shape[:2])
+            if photograph.mask is None
+            else photograph.mask
+            for photograph, looks, meets in zip(self.photographs, self.appearances, self.meets, strict=True)
         ]
 
     def _visible(
@@ -151,10 +167,3 @@ class PyramidLevel:
         to_sphere = Bounds(torch.full_like(rays.origins[:, 0], OCCLUSION_START), meet_sphere(rays).far)
         clear = ~sphere_trace(sdf, rays, to_sphere, MARCH).hit
         return row[visible][clear], other[visible][clear]
-
-
-def _read(sample: SampledRays, images: Sequence[Float[Tensor, "height width c"]]) -> Float[Tensor, "n c"]:
-    """The images' values, one image a view, at the pixels of the sampled rays."""
-    return torch.cat(
-        [image.reshape(-1, image.shape[-1])[sample.pixel[sample.view == view]] for view, image in enumerate(images)]
-    )
