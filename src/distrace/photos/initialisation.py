@@ -58,7 +58,7 @@ class Initialiser:
         return min(places, key=lambda place: median(self._losses(shapes, place, SCREENING_RAYS)))
 
     def ranked(self, place: Similarity) -> list[Coordinates]:
-        """Coordinates of the best training shapes, the least loss first: the best eighth, by more rays than the rest."""
+        """Coordinates of the best training shapes, the least loss first; the best eighth are compared on more rays."""
         shapes = self.training_shapes
         for rays in (SCREENING_RAYS, 1000):
             losses = self._losses(shapes, place, rays)

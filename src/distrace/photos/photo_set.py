@@ -12,18 +12,24 @@ from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
 from distrace.fitting.ray_sampling import drawn
 from distrace.photos.colour_segmentation import ColourModel, appearance
-from distrace.photos.problem import MARCH, ComparisonConfig, PhotoProblem, PlacedShape, RayObservations, TracedShape
+from distrace.photos.problem import (
+    MARCH,
+    NEARBY,
+    ComparisonConfig,
+    PhotoProblem,
+    PlacedShape,
+    RayObservations,
+    TracedShape,
+)
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
-from distrace.photos.visual_hull import Masks, consistent_silhouettes
+from distrace.photos.visual_hull import Masks
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import normals
 from distrace.tracing.sphere_tracing import Trace, sphere_trace
 
-OCCLUSION_START = 0.03  # radii from a surface point at which the search for an occluder starts
 LEAST_COSINE = 0.2  # between a normal and the direction to another view that sees the point
-LEAST_CERTAINTY = 0.3  # below it a pixel's label is unknown
 NEAR_SURFACE = 0.1  # radii: background rays whose least value is larger are left out
 
 Labels = Sequence[Float[Tensor, "height width"]]
@@ -114,27 +120,16 @@ class PhotoSet:
 
     @torch.no_grad()
     def labels(self, sample: SampledRays) -> Labels:
-        """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses.
-
-        Pixels that look like the object where most other views rule it out are unknown.
-        """
-        masks = [2.0 * each.mask - 1 for each in self.photographs if each.mask is not None]
-        if len(masks) == len(self.photographs):
-            return masks
+        """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses."""
         hit = sample.trace.hit
         seen = sample.read(self.appearances)
         outside = [looks.flatten(0, 1)[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
         background = torch.cat([seen[~hit], *outside])
         is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
         model = ColourModel.of(torch.cat([seen[hit], background]), is_object)
-        certainties = [2 * model.smooth_probability(looks) - 1 for looks in self.appearances]
-        cameras = [photograph.camera for photograph in self.photographs]
-        silhouettes = consistent_silhouettes(cameras, [certainty > 0 for certainty in certainties])
         return [
-            2.0 * photograph.mask - 1
-            if photograph.mask is not None
-            else certainty.masked_fill((certainty > 0) & ~silhouette | (certainty.abs() < LEAST_CERTAINTY), 0.0)
-            for photograph, certainty, silhouette in zip(self.photographs, certainties, silhouettes, strict=True)
+            2 * model.smooth_probability(looks) - 1 if photograph.mask is None else 2.0 * photograph.mask - 1
+            for photograph, looks in zip(self.photographs, self.appearances, strict=True)
         ]
 
     def object_masks(self) -> Masks:
@@ -164,6 +159,6 @@ class PhotoSet:
             in_view = other == number
             visible[in_view] &= image.camera.shows(*image.camera.project(place.to_world(points[in_view])))
         rays = rays[visible]
-        to_sphere = Bounds(torch.full_like(rays.origins[:, 0], OCCLUSION_START), meet_sphere(rays).far)
+        to_sphere = Bounds(torch.full_like(rays.origins[:, 0], NEARBY), meet_sphere(rays).far)
         clear = ~sphere_trace(sdf, rays, to_sphere, MARCH).hit
         return row[visible][clear], other[visible][clear]

@@ -23,8 +23,7 @@ from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
-RESTART_MARGIN = 0.05  # radii before its last hit at which a ray's next trace starts: steps move the surface less
-NEAR_MISS = 0.03  # radii: background rays that come closer to the surface get their least value searched
+NEARBY = 0.05  # radii: an iteration moves the surface less
 LEAST_SLOPE = 0.2  # of |∇f · v|: at grazing rays points slide farther than the linearisation holds
 OUTLINE_SATURATION = 3.0  # × the outline scale: beyond it a label is wrong rather than the shape
 PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # prior: rotation (radians), translation (radii), log scale
@@ -105,16 +104,16 @@ class PhotoProblem:
         bounds = meet_sphere(rays)
         start = bounds.near
         if previous is not None:
-            start = torch.where(previous.hit, previous.distance - RESTART_MARGIN, start)
+            start = torch.where(previous.hit, previous.distance - NEARBY, start)
         sdf = Counted(self.decoder.field(self.prior.code(shape.w)))
         trace = sphere_trace(sdf, rays, bounds, MARCH, start)
         to_centre = -(rays.origins * rays.directions).sum(-1)  # for rays that miss the unit sphere
         distance = torch.where(bounds.meets, trace.closest, to_centre)
         wrong = bounds.meets & torch.where(trace.hit, label < 0, label > 0)
         background = (bounds.meets & ~trace.hit & (label < 0)).nonzero()[:, 0]
-        wrong[background] = sdf(rays[background].at(distance[background])) < NEAR_MISS
+        wrong[background] = sdf(rays[background].at(distance[background])) < NEARBY
         within = Bounds(bounds.near[wrong], bounds.far[wrong])
-        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=RESTART_MARGIN, refine=2)
+        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=NEARBY, refine=2)
         self.evaluations += sdf.evaluations
         return TracedShape(shape, distance, trace.hit, wrong)
 
