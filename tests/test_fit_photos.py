@@ -155,7 +155,7 @@ def test_inconsistency_ranks_the_true_shape_first(decoder: Decoder, views: list[
     small = replace(still, scale=torch.tensor(0.6))
     away = replace(still, translation=torch.tensor([0, 0, 9.0]))
     shapes = [PlacedShape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
-    found, evaluations = inconsistencies(PhotoSet.of(decoder, views, PRIOR, COMPARED), shapes, 0)
+    found, evaluations = inconsistencies(PhotoSet(decoder, views, PRIOR, COMPARED), shapes, 0)
     true, same, less, unseen = found
     assert true == same
     assert unseen == inf
@@ -168,7 +168,7 @@ def test_the_jacobian_is_that_of_finite_differences(decoder: Decoder, views: lis
     compared = replace(COMPARED, fit_place=True, rays=600)
     shape = PlacedShape(PRIOR.coordinates(TRUE) + 0.3, MOVED)
     random = torch.Generator().manual_seed(0)
-    photos = PhotoSet.of(decoder, views, PRIOR, compared)
+    photos = PhotoSet(decoder, views, PRIOR, compared)
     problem, state = photos.problem(photos.sample(shape, compared.rays, random))
     before = problem.residuals(state)
     size = 3 * len(problem.pairs)
@@ -239,7 +239,7 @@ def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:
 def test_a_view_with_a_wrong_camera_is_an_outlier(decoder: Decoder, views: list[Photograph]) -> None:
     wrong = [replace(view, camera=view.camera.turned(15.0)) if k == 4 else view for k, view in enumerate(views)]
     shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
-    found, same = (view_agreements(PhotoSet.of(decoder, given, PRIOR, COMPARED), shape) for given in (wrong, views))
+    found, same = (view_agreements(PhotoSet(decoder, given, PRIOR, COMPARED), shape) for given in (wrong, views))
     assert [view.name for view in found if view.is_outlier] == ["04"]
     assert not any(view.is_outlier for view in same)
 
@@ -271,7 +271,7 @@ def test_all_evaluations_are_counted(
 
 
 def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder, views: list[Photograph]) -> None:
-    search = Initialiser(PhotoSet.of(decoder, [view.resized(0.5) for view in views], PRIOR, COMPARED))
+    search = Initialiser(PhotoSet(decoder, [view.resized(0.5) for view in views], PRIOR, COMPARED))
     still = Similarity.identity()
     for place in (replace(still, scale=torch.tensor(0.01)), replace(still, translation=torch.tensor([2.5, 0, 0]))):
         assert search.likelier((place, still)) is still
@@ -282,10 +282,10 @@ def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite
 ) -> None:
     shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
     compared = replace(COMPARED, fit_place=True)
-    photos = PhotoSet.of(decoder, [view.resized(0.5) for view in views], PRIOR, compared)
+    photos = PhotoSet(decoder, [view.resized(0.5) for view in views], PRIOR, compared)
     problem, state = photos.problem(photos.sample(shape, compared.rays, torch.Generator().manual_seed(0)))
     away = problem.retract(state, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
-    rays = shape.place.rays_in_object(problem.observations.rays[problem.pairs[:, 0]])
+    rays = shape.place.rays_in_object(problem.rays[problem.pairs[:, 0]])
     assert not meet_sphere(away.shape.place.rays_in_object(rays)).meets.all(), "some leave it"
     found = problem.residuals(away)
     assert found.values.isfinite().all()

@@ -23,7 +23,7 @@ def views() -> list[Photograph]:
 
 def found(views: list[Photograph], *others: SDF) -> Similarity:
     typical = [bumpy_balls(0.4).field(TRUE), *others]
-    return locate(PhotoSet.of(bumpy_balls(0.4), views, PRIOR, COMPARED), typical, Similarity.identity())
+    return locate(PhotoSet(bumpy_balls(0.4), views, PRIOR, COMPARED), typical, Similarity.identity())
 
 
 @pytest.mark.parametrize("masked", [False, True])

@@ -65,7 +65,7 @@ class Multiview:
         fit = _fitted(model, views, config)
         last = fit.last
         prior = prior_of(model.codes)
-        photos = PhotoSet.of(model.decoder, [view.resized(0.5) for view in views], prior, comparison)
+        photos = PhotoSet(model.decoder, [view.resized(0.5) for view in views], prior, comparison)
         agreed = view_agreements(photos, PlacedShape(prior.coordinates(last.code), last.place))
         for view in agreed:
             if view.is_outlier:

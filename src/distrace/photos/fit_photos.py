@@ -113,7 +113,7 @@ def fit_photos(
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     device = prior.mean.device
-    photos = PhotoSet.of(decoder, [photograph.to(device) for photograph in photographs], prior, config.comparison)
+    photos = PhotoSet(decoder, [photograph.to(device) for photograph in photographs], prior, config.comparison)
     initialiser = Initialiser(photos, config.seed)
     place = (place or Similarity.identity()).to(device)
     fit = PhotoFit()

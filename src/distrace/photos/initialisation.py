@@ -77,7 +77,7 @@ class Initialiser:
 
         Infinite where most views do not show the place or no ray hits the shape, since then nothing contradicts it.
         """
-        cameras = [photograph.camera for photograph in self.photos.photographs]
+        cameras = self.photos.cameras
         showing = sum(bool(camera.shows(*camera.project(place.translation))) for camera in cameras)
         if 2 * showing < len(cameras):
             return [math.inf] * len(shapes)
@@ -99,8 +99,8 @@ def locate(photos: PhotoSet, typical: Sequence[SDF], place: Similarity) -> Simil
     sphere's image. All hulls contain what the views leave open, such as the space below an object seen from above.
     The rotation stays. Returns `place` where there is no hull.
     """
-    every = -(-len(photos.photographs) // 12)  # a dozen views make a hull
-    cameras = [photograph.camera for photograph in photos.photographs[::every]]
+    every = -(-len(photos.cameras) // 12)  # a dozen views make a hull
+    cameras = photos.cameras[::every]
     observed = _hull_extent(cameras, photos.object_masks()[::every], place)
     small = [camera.resized(min(1.0, SILHOUETTE_SIZE / max(camera.height, camera.width))) for camera in cameras]
     extents = []

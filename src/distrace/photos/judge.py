@@ -65,7 +65,7 @@ def _pairwise_differences(problem: PhotoProblem, state: TracedShape, count: int)
     """The median difference of colour between each two views; NaN where they see no point in common."""
     values = problem.residuals(state).values[: 3 * len(problem.pairs)].reshape(-1, 3)
     differences = values.abs().mean(dim=-1) * problem.config.colour_scale
-    first = problem.observations.view[problem.pairs[:, 0]]
+    first = problem.view[problem.pairs[:, 0]]
     second = problem.pairs[:, 1]
     found = torch.full((count, count), torch.nan)
     for a in range(count):

@@ -2,11 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from distrace.camera import Camera
 from distrace.data.photograph import Photograph
 from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
@@ -18,7 +20,6 @@ from distrace.photos.problem import (
     ComparisonConfig,
     PhotoProblem,
     PlacedShape,
-    RayObservations,
     TracedShape,
 )
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
@@ -59,39 +60,45 @@ class PhotoSet:
     """Photographs, and the model whose shapes are compared with them."""
 
     decoder: Decoder
+    photographs: Sequence[Photograph]  # whose cameras see the unit sphere
     prior: Prior
     config: ComparisonConfig
-    photographs: Sequence[Photograph]
-    images: Sequence[GradientImage]  # the colours that are compared
-    neighbours: Int[Tensor, "views count"]  # −1 where there are fewer
-    appearances: Sequence[Float[Tensor, "height width 4"]]  # for the segmentation
-    meets: Sequence[Bool[Tensor, "pixels"]]  # whether the pixels' rays meet the unit sphere
 
-    @staticmethod
-    def of(decoder: Decoder, photographs: Sequence[Photograph], prior: Prior, config: ComparisonConfig) -> "PhotoSet":
-        """Prepares photographs whose cameras see the unit sphere."""
-        colours = [each.image if config.same_light else normalise_light(each.image) for each in photographs]
-        cameras = [each.camera for each in photographs]
-        return PhotoSet(
-            decoder,
-            prior,
-            config,
-            photographs,
-            [GradientImage.of(colour, camera) for colour, camera in zip(colours, cameras, strict=True)],
-            neighbour_views(cameras, config.neighbours),
-            [appearance(each.image) for each in photographs],
-            [meet_sphere(camera.rays()).meets.reshape(-1) for camera in cameras],
-        )
+    @cached_property
+    def cameras(self) -> list[Camera]:
+        """The photographs' cameras."""
+        return [photograph.camera for photograph in self.photographs]
+
+    @cached_property
+    def images(self) -> list[GradientImage]:
+        """The colours that are compared."""
+        light = (lambda image: image) if self.config.same_light else normalise_light
+        return [GradientImage.of(light(each.image), each.camera) for each in self.photographs]
+
+    @cached_property
+    def neighbours(self) -> Int[Tensor, "views count"]:
+        """The views that each is compared with; −1 where there are fewer."""
+        return neighbour_views(self.cameras, self.config.neighbours)
+
+    @cached_property
+    def appearances(self) -> list[Float[Tensor, "height width 4"]]:
+        """What the segmentation distinguishes pixels by."""
+        return [appearance(photograph.image) for photograph in self.photographs]
+
+    @cached_property
+    def meets(self) -> list[Bool[Tensor, "height width"]]:
+        """Whether the pixels' rays meet the unit sphere."""
+        return [meet_sphere(camera.rays()).meets for camera in self.cameras]
 
     @torch.no_grad()
     def sample(self, shape: PlacedShape, rays: int, random: torch.Generator) -> SampledRays:
         """Draws rays that meet the unit sphere, as many from each view, and traces a shape along them."""
-        share = -(-rays // len(self.photographs))
-        chosen = [drawn(meets.nonzero()[:, 0], share, random) for meets in self.meets]
+        share = -(-rays // len(self.cameras))
+        chosen = [drawn(meets.flatten().nonzero()[:, 0], share, random) for meets in self.meets]
         view = torch.cat([torch.full_like(pixels, number) for number, pixels in enumerate(chosen)])
         parts = [
-            photograph.camera.rays(photograph.camera.pixels().reshape(-1, 2)[pixels])
-            for photograph, pixels in zip(self.photographs, chosen, strict=True)
+            camera.rays(camera.pixels().flatten(0, 1)[pixels])
+            for camera, pixels in zip(self.cameras, chosen, strict=True)
         ]
         rays_world = Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
         rays_object = shape.place.rays_in_object(rays_world)
@@ -108,14 +115,24 @@ class PhotoSet:
         label = sample.read([label[..., None] for label in labels or self.labels(sample)])[:, 0]
         least = sample.sdf(sample.rays_object.at(trace.closest.nan_to_num(posinf=0.0)))
         used = (trace.hit | (label > 0) | (label < 0) & (least < NEAR_SURFACE)).nonzero()[:, 0]
-        observations = RayObservations(sample.rays_world, sample.view, colour, label)[used]
         trace = trace[used]
-        compared = (trace.hit & (observations.label >= 0)).nonzero()[:, 0]
+        view = sample.view[used]
+        compared = (trace.hit & (label[used] >= 0)).nonzero()[:, 0]
         points = sample.rays_object[used][compared].at(trace.distance[compared])
-        rows, neighbours = self._visible(observations.view[compared], shape.place, points, sample.sdf)
-        pairs = torch.stack([compared[rows], neighbours], dim=1)
-        problem = PhotoProblem(self.decoder, self.prior, observations, self.images, pairs, self.config, shape.place)
-        problem.evaluations = sample.sdf.evaluations
+        rows, neighbours = self._visible(view[compared], shape.place, points, sample.sdf)
+        problem = PhotoProblem(
+            self.decoder,
+            self.prior,
+            self.config,
+            self.images,
+            sample.rays_world[used],
+            view,
+            colour[used],
+            label[used],
+            torch.stack([compared[rows], neighbours], dim=1),
+            expected_place=shape.place,
+            evaluations=sample.sdf.evaluations,
+        )
         return problem, problem.trace(shape, TracedShape(shape, trace.closest, trace.hit, trace.hit))
 
     @torch.no_grad()
@@ -123,7 +140,7 @@ class PhotoSet:
         """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses."""
         hit = sample.trace.hit
         seen = sample.read(self.appearances)
-        outside = [looks.flatten(0, 1)[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
+        outside = [looks[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
         background = torch.cat([seen[~hit], *outside])
         is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
         model = ColourModel.of(torch.cat([seen[hit], background]), is_object)
@@ -134,11 +151,12 @@ class PhotoSet:
 
     def object_masks(self) -> Masks:
         """The masks or, without them, the pixels whose appearance is rare where rays miss the unit sphere."""
-        model = ColourModel.of(torch.cat([looks.flatten(0, 1) for looks in self.appearances]), torch.cat([*self.meets]))
+        model = ColourModel.of(
+            torch.cat([looks.flatten(0, 1) for looks in self.appearances]),
+            torch.cat([meets.flatten() for meets in self.meets]),
+        )
         return [
-            (model.smooth_probability(looks) > 0.6) & meets.reshape(looks.shape[:2])
-            if photograph.mask is None
-            else photograph.mask
+            (model.smooth_probability(looks) > 0.6) & meets if photograph.mask is None else photograph.mask
             for photograph, looks, meets in zip(self.photographs, self.appearances, self.meets, strict=True)
         ]
 
@@ -151,13 +169,13 @@ class PhotoSet:
         other = neighbours[row, column]
         points = points_object[row]
         normal = normals(sdf, points_object)[row]
-        eyes = torch.stack([image.camera.T_world_camera[:3, 3] for image in self.images])[other]
+        eyes = torch.stack([camera.T_world_camera[:3, 3] for camera in self.cameras])[other]
         to_eye = place.to_object(eyes) - points
         rays = Rays(points, to_eye / to_eye.norm(dim=-1, keepdim=True))
         visible = (rays.directions * normal).sum(-1) > LEAST_COSINE
-        for number, image in enumerate(self.images):
+        for number, camera in enumerate(self.cameras):
             in_view = other == number
-            visible[in_view] &= image.camera.shows(*image.camera.project(place.to_world(points[in_view])))
+            visible[in_view] &= camera.shows(*camera.project(place.to_world(points[in_view])))
         rays = rays[visible]
         to_sphere = Bounds(torch.full_like(rays.origins[:, 0], NEARBY), meet_sphere(rays).far)
         clear = ~sphere_trace(sdf, rays, to_sphere, MARCH).hit

@@ -52,19 +52,6 @@ class ComparisonConfig:
 
 
 @dataclass(frozen=True)
-class RayObservations:
-    """World rays of all views, and what the photographs show there."""
-
-    rays: Rays
-    view: Int[Tensor, "n"]
-    colour: Float[Tensor, "n channels"]
-    label: Float[Tensor, "n"]  # the certainty of the object, up to 1, or of the background, down to −1; 0: unknown
-
-    def __getitem__(self, rows: Tensor) -> "RayObservations":
-        return RayObservations(self.rays[rows], self.view[rows], self.colour[rows], self.label[rows])
-
-
-@dataclass(frozen=True)
 class PlacedShape:
     """The unknowns: a code's coordinates in the prior, and the shape's placement in the world."""
 
@@ -88,10 +75,13 @@ class PhotoProblem:
 
     decoder: Decoder
     prior: Prior
-    observations: RayObservations
-    images: Sequence[GradientImage]
-    pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     config: ComparisonConfig
+    images: Sequence[GradientImage]
+    rays: Rays  # in the world, of all views
+    view: Int[Tensor, "n"]
+    colour: Float[Tensor, "n channels"]
+    label: Float[Tensor, "n"]  # the certainty of the object, up to 1, or of the background, down to −1; 0: unknown
+    pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     expected_place: Similarity  # the mean of the placement's prior
     outline_scale: float = 0.02  # radii: larger outline residuals count linearly
     evaluations: int = 0
@@ -99,8 +89,7 @@ class PhotoProblem:
     @torch.no_grad()
     def trace(self, shape: PlacedShape, previous: TracedShape | None = None) -> TracedShape:
         """Traces all rays; those that hit `previous` start shortly before that hit."""
-        rays = shape.place.rays_in_object(self.observations.rays)
-        label = self.observations.label
+        rays = shape.place.rays_in_object(self.rays)
         bounds = meet_sphere(rays)
         start = bounds.near
         if previous is not None:
@@ -109,8 +98,8 @@ class PhotoProblem:
         trace = sphere_trace(sdf, rays, bounds, MARCH, start)
         to_centre = -(rays.origins * rays.directions).sum(-1)  # for rays that miss the unit sphere
         distance = torch.where(bounds.meets, trace.closest, to_centre)
-        wrong = bounds.meets & torch.where(trace.hit, label < 0, label > 0)
-        background = (bounds.meets & ~trace.hit & (label < 0)).nonzero()[:, 0]
+        wrong = bounds.meets & torch.where(trace.hit, self.label < 0, self.label > 0)
+        background = (bounds.meets & ~trace.hit & (self.label < 0)).nonzero()[:, 0]
         wrong[background] = sdf(rays[background].at(distance[background])) < NEARBY
         within = Bounds(bounds.near[wrong], bounds.far[wrong])
         distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=NEARBY, refine=2)
@@ -146,7 +135,7 @@ class PhotoProblem:
     def _linearise(self, state: TracedShape, rows: Int[Tensor, "rays"]) -> "_SurfacePoints":
         """Points on some rays, with the field's values and derivatives."""
         place = state.shape.place
-        rays = self.observations.rays[rows]
+        rays = self.rays[rows]
         points = place.rays_in_object(rays).at(state.distance[rows])
         values, gradient, by_code = derivatives(self.decoder, points, self.prior.code(state.shape.w))
         self.evaluations += len(values)
@@ -171,8 +160,8 @@ class PhotoProblem:
             image = self.images[view]
             pixels, by_point = image.project(points.points_world[rows[in_view]])
             colours, gradients = image.at(pixels)
-            values[in_view] = colours - self.observations.colour[rays[in_view]]
-            motion = (by_point * self.observations.rays.directions[rays[in_view], None]).sum(-1)
+            values[in_view] = colours - self.colour[rays[in_view]]
+            motion = (by_point * self.rays.directions[rays[in_view], None]).sum(-1)
             along_ray[in_view] = (gradients * motion[:, None]).sum(-1)
         slope = points.slope[rows]
         slide = -points.scale / slope.clamp_max(-LEAST_SLOPE) * (state.hit[rays] & (slope < 0))
@@ -188,7 +177,7 @@ class PhotoProblem:
         """
         wrong = state.wrong.nonzero()[:, 0]
         rows = points.row_of_ray[wrong]
-        label = self.observations.label[wrong]
+        label = self.label[wrong]
         least = points.values[rows]
         excess = torch.where(label > 0, least.clamp_min(0), (least - self.config.margin).clamp_max(0))
         excess = excess / self.outline_scale
