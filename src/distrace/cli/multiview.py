@@ -42,7 +42,7 @@ class Multiview:
     changing_light: Flag = False  # ignore local brightness and contrast of colours
     ignore_masks: Flag = False  # use no masks
     size: int = 1024  # pixels along the longer side; larger photographs are scaled down
-    rays: int = ComparisonConfig.rays  # of all views together, in each stage
+    rays: int = ComparisonConfig.rays  # of all views together, in each round
     resolution: int = 256  # cells along each side of the mesh's grid
     seed: int = 0
     device: str = "cpu"

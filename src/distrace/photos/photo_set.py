@@ -14,14 +14,7 @@ from distrace.fields.base import SDF, Counted
 from distrace.fields.decoder import Decoder
 from distrace.fitting.ray_sampling import drawn
 from distrace.photos.colour_segmentation import ColourModel, appearance
-from distrace.photos.problem import (
-    MARCH,
-    NEARBY,
-    ComparisonConfig,
-    PhotoProblem,
-    PlacedShape,
-    TracedShape,
-)
+from distrace.photos.problem import MARCH, NEARBY, ComparisonConfig, PhotoProblem, PlacedShape, TracedShape
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
 from distrace.photos.visual_hull import Masks
 from distrace.pose import Similarity
