@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
+from typing import Any
 
 import pytest
 import torch
@@ -30,7 +31,7 @@ PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
 TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
 GREY = torch.tensor([0.4, 0.45, 0.5])
 COMPARED = ComparisonConfig(rays=1500, neighbours=3, fit_place=False)
-CONFIG = PhotoConfig(rounds=4, iterations=3, starts=1, comparison=COMPARED)
+CONFIG = PhotoConfig(rounds=4, coarse_rounds=2, iterations=3, starts=1, comparison=COMPARED)
 MEAN = PlacedShape(torch.zeros(4), Similarity.identity())
 MOVED = Similarity.identity().moved(torch.tensor([0.05, -0.08, 0.04, 0.03, -0.02, 0.03, 0.05]))
 
@@ -256,7 +257,7 @@ def test_all_evaluations_are_counted(
     made = 0
     run = Decoder._run
 
-    def counting(self: Decoder, layers: list, points: Tensor, *watch: object) -> Tensor:
+    def counting(self: Decoder, layers: list, points: Tensor, *watch: Any) -> Tensor:
         nonlocal made
         made += points.numel() // 3
         return run(self, layers, points, *watch)

@@ -174,7 +174,8 @@ def _fitted(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
         return step.code, identity
     if trial.method == "nearest":
-        best = Initialiser(PhotoSet(model.decoder, views, prior, config.comparison)).ranked(identity)[0]
+        coarse = PhotoSet(model.decoder, [view.resized(0.5) for view in views], prior, config.comparison)
+        best = Initialiser(coarse).ranked(identity)[0]
         return prior.code(best), identity
     place = disturbed(hash_of(clip["shape"])) if config.comparison.fit_place else identity
     last = fit_photos(model.decoder, views, prior, config, place).last

@@ -1,7 +1,7 @@
 """Fits a shape's code and placement to photographs with known cameras: no depth, and masks only where given.
 
-Multi-start Levenberg–Marquardt. As in DIST (Liu et al., CVPR 2020, section 4.3) the shape and a similarity are fitted
-together.
+Multi-start Levenberg–Marquardt, from coarse images to fine ones. As in DIST (Liu et al., CVPR 2020, section 4.3) the
+shape and a similarity are fitted together.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,6 +29,7 @@ class PhotoConfig:
     """The schedule, in rounds of a few iterations on the same rays; each round draws new ones."""
 
     rounds: int = 18
+    coarse_rounds: int = 4  # the first of each start, with images of half the size; a trial ends with fine ones
     iterations: int = 4  # of each round
     starts: int = 4
     trial_rounds: int = 6  # of each start, before the best one goes on
@@ -113,15 +114,18 @@ def fit_photos(
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     device = prior.mean.device
-    photos = PhotoSet(decoder, [photograph.to(device) for photograph in photographs], prior, config.comparison)
-    initialiser = Initialiser(photos, config.seed)
+    views = [photograph.to(device) for photograph in photographs]
+    fine = PhotoSet(decoder, views, prior, config.comparison)
+    coarse = PhotoSet(decoder, [view.resized(0.5) for view in views], prior, config.comparison)
+    levels = [coarse if number < config.coarse_rounds else fine for number in range(config.rounds)]
+    initialiser = Initialiser(levels[0], config.seed)
     place = (place or Similarity.identity()).to(device)
     fit = PhotoFit()
 
     if config.comparison.fit_place:
-        place = initialiser.likelier([place, initialiser.locate(place)])
+        place = initialiser.likelier([place, initialiser.locate(fine, place)])
         mean_shape = _Descent(PLACEMENT, PlacedShape(initialiser.mean_shape, place), config)
-        mean_shape.run(photos, config.place_rounds, fit, callback)
+        mean_shape.run(levels, config.place_rounds, fit, callback)
         place = mean_shape.shape.place
 
     starts = initialiser.starts(place, config.starts)
@@ -129,11 +133,11 @@ def fit_photos(
     best = 0
     if config.tried:
         for descent in descents:
-            descent.run(photos, config.tried, fit, callback)
-        verdicts, evaluations = inconsistencies(photos, [descent.shape for descent in descents], config.seed)
+            descent.run(levels, config.tried, fit, callback)
+        verdicts, evaluations = inconsistencies(fine, [descent.shape for descent in descents], config.seed)
         fit.evaluations += evaluations
         best = min(range(len(verdicts)), key=lambda start: verdicts[start])
-    descents[best].run(photos, config.rounds, fit, callback)
+    descents[best].run(levels, config.rounds, fit, callback)
     fit.setup_evaluations = initialiser.evaluations
     fit.evaluations += initialiser.evaluations
     return fit
@@ -151,10 +155,13 @@ class _Descent:
         self.random = torch.Generator().manual_seed(config.seed)
         self.rounds = 0
 
-    def run(self, photos: PhotoSet, rounds: int, fit: PhotoFit, callback: Callable[[PhotoStep], None]) -> None:
-        """Goes on until so many rounds of it are done, as far as the schedule has them."""
+    def run(
+        self, levels: Sequence[PhotoSet], rounds: int, fit: PhotoFit, callback: Callable[[PhotoStep], None]
+    ) -> None:
+        """Goes on until so many rounds of it are done, as far as there are levels, one for each round."""
         config = self.config
-        for number in range(self.rounds, min(rounds, config.rounds)):
+        for number in range(self.rounds, min(rounds, len(levels))):
+            photos = levels[number]
             sample = photos.sample(self.shape, config.comparison.rays, self.random)
             problem, state = photos.problem(sample)
             problem.expected_place = self.expected_place

@@ -42,12 +42,15 @@ class Initialiser:
         """The coordinates of the mean."""
         return self.photos.prior.start(0, self.seed)
 
-    def locate(self, place: Similarity) -> Similarity:
-        """`locate` with the five training shapes nearest to the mean, or with the mean shape where there are none."""
+    def locate(self, photos: PhotoSet, place: Similarity) -> Similarity:
+        """`locate` with the five training shapes nearest to the mean, or with the mean shape where there are none.
+
+        `photos` are of full size: in coarse ones thin legs are lost.
+        """
         prior = self.photos.prior
         typical = sorted(self.training_shapes, key=torch.norm)[:5] or [self.mean_shape]
         shapes = [Counted(self.photos.decoder.field(prior.code(w))) for w in typical]
-        found = locate(self.photos, shapes, place)
+        found = locate(photos, shapes, place)
         self.evaluations += sum(shape.evaluations for shape in shapes)
         return found
 
