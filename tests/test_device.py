@@ -128,7 +128,9 @@ def test_photographs_are_brought_to_the_model(
     for name, little in (("SHOWN", 1), ("FRAMES", 1), ("SIZE", 24)):
         monkeypatch.setattr(views_page, name, little)
     for name in ("KNOWN_PLACE", "UNKNOWN_PLACE"):
-        short = replace(getattr(multiview, name), iterations=3, trial=1, place_iterations=1, levels=(0.5, 1.0))
+        short = replace(
+            getattr(multiview, name), rounds=2, coarse_rounds=1, iterations=2, trial_rounds=1, place_rounds=1
+        )
         monkeypatch.setattr(multiview, name, short)
     command("multiview", model, photographs, *more, "--starts", 2, "--rays", 200, "--resolution", 16)
     assert (tmp_path / "out" / "result.json").exists()

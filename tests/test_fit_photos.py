@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
+from typing import Any
 
 import pytest
 import torch
@@ -17,9 +18,9 @@ from distrace.fields.decoder import Decoder
 from distrace.photos.colour_segmentation import ColourModel, appearance
 from distrace.photos.fit_photos import PhotoConfig, fit_photos
 from distrace.photos.initialisation import Initialiser
-from distrace.photos.pyramid import PyramidLevel
-from distrace.photos.residuals import ComparisonConfig, PhotoProblem, PlacedShape
-from distrace.photos.selection import inconsistencies, view_agreements
+from distrace.photos.judge import inconsistencies, view_agreements
+from distrace.photos.photo_set import PhotoSet
+from distrace.photos.problem import ComparisonConfig, PhotoProblem, PlacedShape
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -30,7 +31,7 @@ PRIOR = Prior(torch.zeros(4), 0.3 * torch.eye(4) + 0.05)
 TRUE = torch.tensor([0.4, -0.3, 0.2, -0.4])
 GREY = torch.tensor([0.4, 0.45, 0.5])
 COMPARED = ComparisonConfig(rays=1500, neighbours=3, fit_place=False)
-CONFIG = PhotoConfig(iterations=12, starts=1, levels=(0.5, 0.5, 1.0, 1.0), comparison=COMPARED)
+CONFIG = PhotoConfig(rounds=4, coarse_rounds=2, iterations=3, starts=1, comparison=COMPARED)
 MEAN = PlacedShape(torch.zeros(4), Similarity.identity())
 MOVED = Similarity.identity().moved(torch.tensor([0.05, -0.08, 0.04, 0.03, -0.02, 0.03, 0.05]))
 
@@ -75,7 +76,7 @@ def error(decoder: Decoder, shape: PlacedShape, place: Similarity | None = None)
 
 
 def fitted(decoder: Decoder, views: list[Photograph], config: PhotoConfig) -> PlacedShape:
-    *_, last = fit_photos(decoder, views, PRIOR, config)
+    last = fit_photos(decoder, views, PRIOR, config).last
     return PlacedShape(PRIOR.coordinates(last.code), last.place)
 
 
@@ -151,16 +152,16 @@ def test_a_leg_one_pixel_wide_is_labelled_neither_object_nor_background() -> Non
 
 
 def test_inconsistency_ranks_the_true_shape_first(decoder: Decoder, views: list[Photograph]) -> None:
-    level = PyramidLevel.of(views, 1.0, COMPARED)
     still = Similarity.identity()
     small = replace(still, scale=torch.tensor(0.6))
     away = replace(still, translation=torch.tensor([0, 0, 9.0]))
     shapes = [PlacedShape(PRIOR.coordinates(TRUE), place) for place in (still, still, small, away)]
-    true, same, less, unseen = inconsistencies(level, decoder, PRIOR, shapes, COMPARED, 0)
+    found, evaluations = inconsistencies(PhotoSet(decoder, views, PRIOR, COMPARED), shapes, 0)
+    true, same, less, unseen = found
     assert true == same
-    assert unseen[0] == inf
-    assert less[0] > 1.2 * true[0]
-    assert min(true[1], less[1]) > COMPARED.rays
+    assert unseen == inf
+    assert less > 1.2 * true
+    assert evaluations > 3 * COMPARED.rays
 
 
 @pytest.mark.parametrize("kind", ["colour", "outline"])
@@ -168,8 +169,8 @@ def test_the_jacobian_is_that_of_finite_differences(decoder: Decoder, views: lis
     compared = replace(COMPARED, fit_place=True, rays=600)
     shape = PlacedShape(PRIOR.coordinates(TRUE) + 0.3, MOVED)
     random = torch.Generator().manual_seed(0)
-    level = PyramidLevel.of(views, 1.0, compared)
-    problem, state = level.problem(level.sample(decoder, PRIOR, shape, compared.rays, random), compared)
+    photos = PhotoSet(decoder, views, PRIOR, compared)
+    problem, state = photos.problem(photos.sample(shape, compared.rays, random))
     before = problem.residuals(state)
     size = 3 * len(problem.pairs)
     rows = torch.arange(len(before.values))
@@ -207,16 +208,18 @@ def test_a_code_and_a_placement_are_fitted_together(decoder: Decoder, monkeypatc
     places = []
     starts = Initialiser.starts
 
-    def recording(initialiser: Initialiser, level: PyramidLevel, *given: object) -> list[Tensor]:
-        places.append(given[1])
-        return starts(initialiser, level, *given)
+    def recording(initialiser: Initialiser, place: Similarity, count: int) -> list[Tensor]:
+        places.append(place)
+        return starts(initialiser, place, count)
 
     monkeypatch.setattr(Initialiser, "starts", recording)
-    config = replace(CONFIG, iterations=20, place_iterations=8, comparison=replace(COMPARED, fit_place=True))
-    steps = list(fit_photos(decoder, photographs(decoder, ring(), MOVED), PRIOR, config))
-    assert [step.name for step in steps] == ["placement"] * 8 + ["start 1"] * 20
+    config = replace(CONFIG, iterations=5, place_rounds=2, comparison=replace(COMPARED, fit_place=True))
+    given = []
+    steps = fit_photos(decoder, photographs(decoder, ring(), MOVED), PRIOR, config, callback=given.append).steps
+    assert [step.name for step in steps] == ["placement"] * 10 + ["start 1"] * 20
+    assert all(one is other for one, other in zip(given, steps, strict=True))
     assert len(steps) == config.total
-    assert [id(place) for place in places] == [id(steps[7].place)], "starts begin where the mean shape has come to"
+    assert [id(place) for place in places] == [id(steps[9].place)], "starts begin where the mean shape has come to"
     found = PlacedShape(PRIOR.coordinates(steps[-1].code), steps[-1].place)  # 0.143 to 0.156 by seed
     assert error(decoder, found, MOVED) < 0.17 * error(decoder, MEAN, MOVED)
 
@@ -237,8 +240,9 @@ def test_a_place_in_the_world_maps_points_and_rays_alike() -> None:
 def test_a_view_with_a_wrong_camera_is_an_outlier(decoder: Decoder, views: list[Photograph]) -> None:
     wrong = [replace(view, camera=view.camera.turned(15.0)) if k == 4 else view for k, view in enumerate(views)]
     shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
-    assert [view.name for view in view_agreements(decoder, wrong, PRIOR, shape, COMPARED) if view.is_outlier] == ["04"]
-    assert not any(view.is_outlier for view in view_agreements(decoder, views, PRIOR, shape, COMPARED))
+    found, same = (view_agreements(PhotoSet(decoder, given, PRIOR, COMPARED), shape) for given in (wrong, views))
+    assert [view.name for view in found if view.is_outlier] == ["04"]
+    assert not any(view.is_outlier for view in same)
 
 
 def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) -> None:
@@ -253,38 +257,36 @@ def test_all_evaluations_are_counted(
     made = 0
     run = Decoder._run
 
-    def counting(self: Decoder, layers: list, points: Tensor, *watch: object) -> Tensor:
+    def counting(self: Decoder, layers: list, points: Tensor, *watch: Any) -> Tensor:
         nonlocal made
         made += points.numel() // 3
         return run(self, layers, points, *watch)
 
     monkeypatch.setattr(Decoder, "_run", counting)
     compared = replace(COMPARED, rays=300, fit_place=True)
-    first, *others = fit_photos(
-        decoder, views, PRIOR, replace(CONFIG, iterations=4, starts=2, trial=2, place_iterations=2, comparison=compared)
-    )
-    assert first.evaluations + sum(step.evaluations for step in others) == pytest.approx(made, rel=0.01)
-    assert 0 < first.searched < first.evaluations
+    config = replace(CONFIG, rounds=2, iterations=2, starts=2, trial_rounds=1, place_rounds=1, comparison=compared)
+    fit = fit_photos(decoder, views, PRIOR, config)
+    assert len(fit.steps) == config.total
+    assert fit.evaluations == pytest.approx(made, rel=0.01)
+    assert 0 < fit.setup_evaluations < fit.evaluations
 
 
 def test_a_place_where_no_view_sees_the_shape_is_never_likelier(decoder: Decoder, views: list[Photograph]) -> None:
-    level = PyramidLevel.of(views, 0.5, COMPARED)
-    search = Initialiser(decoder, PRIOR)
+    search = Initialiser(PhotoSet(decoder, [view.resized(0.5) for view in views], PRIOR, COMPARED))
     still = Similarity.identity()
     for place in (replace(still, scale=torch.tensor(0.01)), replace(still, translation=torch.tensor([2.5, 0, 0]))):
-        assert search.likelier(level, COMPARED, (place, still)) is still
+        assert search.likelier((place, still)) is still
 
 
 def test_a_ray_that_leaves_the_sphere_of_a_moved_object_makes_no_number_infinite(
     decoder: Decoder, views: list[Photograph]
 ) -> None:
     shape = PlacedShape(PRIOR.coordinates(TRUE), Similarity.identity())
-    level = PyramidLevel.of(views, 0.5, COMPARED)
     compared = replace(COMPARED, fit_place=True)
-    sample = level.sample(decoder, PRIOR, shape, compared.rays, torch.Generator().manual_seed(0))
-    problem, state = level.problem(sample, compared)
+    photos = PhotoSet(decoder, [view.resized(0.5) for view in views], PRIOR, compared)
+    problem, state = photos.problem(photos.sample(shape, compared.rays, torch.Generator().manual_seed(0)))
     away = problem.retract(state, torch.tensor([0.0] * 7 + [0.4, 0.3, 0.0, -0.2]))
-    rays = shape.place.rays_in_object(problem.observations.rays[problem.pairs[:, 0]])
+    rays = shape.place.rays_in_object(problem.rays[problem.pairs[:, 0]])
     assert not meet_sphere(away.shape.place.rays_in_object(rays)).meets.all(), "some leave it"
     found = problem.residuals(away)
     assert found.values.isfinite().all()

@@ -5,12 +5,12 @@ from dataclasses import replace
 import pytest
 import torch
 from bumpy import bumpy_balls
-from test_fit_photos import COMPARED, GREY, TRUE, photographs, ring
+from test_fit_photos import COMPARED, GREY, PRIOR, TRUE, photographs, ring
 
 from distrace.data.photograph import Photograph
 from distrace.fields.base import SDF, placed
 from distrace.photos.initialisation import locate
-from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.photo_set import PhotoSet
 from distrace.pose import Similarity
 
 SHIFTED = Similarity(torch.eye(3), torch.tensor([0.15, -0.1, 0.12]), torch.tensor(0.9))
@@ -23,7 +23,7 @@ def views() -> list[Photograph]:
 
 def found(views: list[Photograph], *others: SDF) -> Similarity:
     typical = [bumpy_balls(0.4).field(TRUE), *others]
-    return locate(PyramidLevel.of(views, 1.0, COMPARED), typical, Similarity.identity())
+    return locate(PhotoSet(bumpy_balls(0.4), views, PRIOR, COMPARED), typical, Similarity.identity())
 
 
 @pytest.mark.parametrize("masked", [False, True])

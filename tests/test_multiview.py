@@ -42,7 +42,9 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     tmp_path: Path, model: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_views(tmp_path / "views", ring(6, 40))
-    monkeypatch.setattr("distrace.cli.multiview.KNOWN_PLACE", replace(KNOWN_PLACE, iterations=2, levels=(0.5, 1.0)))
+    monkeypatch.setattr(
+        "distrace.cli.multiview.KNOWN_PLACE", replace(KNOWN_PLACE, rounds=2, coarse_rounds=1, iterations=1)
+    )
     for name in ("SHOWN", "FRAMES"):
         monkeypatch.setattr(f"distrace.report.views_page.{name}", 2)
     out = tmp_path / "out"

@@ -31,7 +31,7 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
 from distrace.photos.initialisation import Initialiser
-from distrace.photos.pyramid import PyramidLevel
+from distrace.photos.photo_set import PhotoSet
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from experiments.baselines.semi_global import stereo_points
@@ -174,11 +174,11 @@ def _fitted(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float
         *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
         return step.code, identity
     if trial.method == "nearest":
-        level = PyramidLevel.of(views, config.levels[0], config.comparison)
-        best = Initialiser(model.decoder, prior).ranked(level, config.comparison, identity)[0]
+        coarse = PhotoSet(model.decoder, [view.resized(0.5) for view in views], prior, config.comparison)
+        best = Initialiser(coarse).ranked(identity)[0]
         return prior.code(best), identity
     place = disturbed(hash_of(clip["shape"])) if config.comparison.fit_place else identity
-    *_, last = fit_photos(model.decoder, views, prior, config, place)
+    last = fit_photos(model.decoder, views, prior, config, place).last
     return last.code, last.place
 
 

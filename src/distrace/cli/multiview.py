@@ -16,9 +16,10 @@ from distrace.data.photographs import Photograph, Photographs, load_photographs,
 from distrace.files import save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
-from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoStep, fit_photos
-from distrace.photos.residuals import ComparisonConfig, PlacedShape
-from distrace.photos.selection import ViewAgreement, view_agreements
+from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoFit, PhotoStep, fit_photos
+from distrace.photos.judge import ViewAgreement, view_agreements
+from distrace.photos.photo_set import PhotoSet
+from distrace.photos.problem import ComparisonConfig, PlacedShape
 from distrace.prior import prior_of
 from distrace.report.views_page import forming, views_page
 
@@ -41,7 +42,7 @@ class Multiview:
     changing_light: Flag = False  # ignore local brightness and contrast of colours
     ignore_masks: Flag = False  # use no masks
     size: int = 1024  # pixels along the longer side; larger photographs are scaled down
-    rays: int = ComparisonConfig.rays  # of all views together, in each stage
+    rays: int = ComparisonConfig.rays  # of all views together, in each round
     resolution: int = 256  # cells along each side of the mesh's grid
     seed: int = 0
     device: str = "cpu"
@@ -61,11 +62,11 @@ class Multiview:
         usual = KNOWN_PLACE if self.fixed else UNKNOWN_PLACE
         comparison = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
         config = replace(usual, starts=self.starts, seed=self.seed, comparison=comparison)
-        steps = _fitted(model, views, config)
-        last = steps[-1]
+        fit = _fitted(model, views, config)
+        last = fit.last
         prior = prior_of(model.codes)
-        shape = PlacedShape(prior.coordinates(last.code), last.place)
-        agreed = view_agreements(model.decoder, views, prior, shape, comparison)
+        photos = PhotoSet(model.decoder, [view.resized(0.5) for view in views], prior, comparison)
+        agreed = view_agreements(photos, PlacedShape(prior.coordinates(last.code), last.place))
         for view in agreed:
             if view.is_outlier:
                 run.warn(_doubt(view))
@@ -73,9 +74,9 @@ class Multiview:
         save_mesh(run.out / "mesh.ply", mesh)
         with written(run.out / "code.npy") as file:
             np.save(file, last.code.cpu().numpy())
-        save_gif(run.out / "forming.gif", forming(model, steps, views[0].camera))
+        save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
-            save_text(run.out / "report.html", views_page(model, views, steps, agreed, mesh))
+            save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
         run.finish(
             {
                 "loss": last.loss,
@@ -84,19 +85,19 @@ class Multiview:
                 "T_unit_object": last.place.T_world_object.tolist(),
                 "unit_sphere": found.placement.described(),
                 "doubtful": [view.name for view in agreed if view.is_outlier],
-                "evaluations": sum(step.evaluations for step in steps),
-                "setup_evaluations": sum(step.searched for step in steps),
+                "evaluations": fit.evaluations,
+                "setup_evaluations": fit.setup_evaluations,
             }
         )
 
 
-def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> list[PhotoStep]:
-    steps: list[PhotoStep] = []
+def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> PhotoFit:
     with progress("fitting", config.total) as bar:
-        for step in fit_photos(model.decoder, views, prior_of(model.codes), config):
-            steps.append(step)
+
+        def advance(step: PhotoStep) -> None:
             bar.advance(f"{step.name}, loss {step.loss:.4f}")
-    return steps
+
+        return fit_photos(model.decoder, views, prior_of(model.codes), config, callback=advance)
 
 
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> "trimesh.Trimesh":

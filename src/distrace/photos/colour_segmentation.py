@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.nn.functional import conv3d, grid_sample, max_pool2d
+from torch.nn.functional import avg_pool3d, grid_sample, max_pool2d
 
 from distrace.photos.stereo_pairs import window_mean, window_moments
 
@@ -69,12 +69,5 @@ def _histogram(appearances: Float[Tensor, "n 4"]) -> Float[Tensor, "roughness bi
     red, green, blue = (appearances[:, :3] * BINS).long().clamp(0, BINS - 1).T
     levels = 1 + len(ROUGHNESS_LEVELS)
     bin_index = ((appearances[:, 3].long() * BINS + red) * BINS + green) * BINS + blue
-    counts = torch.bincount(bin_index, minlength=levels * BINS**3).reshape(levels, 1, BINS, BINS, BINS).to(appearances)
-    kernel = torch.tensor([1.0, 2.0, 1.0]).to(appearances) / 4
-    for axis in range(3):
-        shape = [1, 1, 1, 1, 1]
-        padding = [0, 0, 0]
-        shape[2 + axis] = 3
-        padding[axis] = 1
-        counts = conv3d(counts, kernel.reshape(shape), padding=padding)
-    return counts[:, 0] / max(len(appearances), 1)
+    counts = torch.bincount(bin_index, minlength=levels * BINS**3).reshape(levels, BINS, BINS, BINS).to(appearances)
+    return avg_pool3d(counts, 3, 1, 1) / max(len(appearances), 1)

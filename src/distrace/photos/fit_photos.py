@@ -1,24 +1,23 @@
 """Fits a shape's code and placement to photographs with known cameras: no depth, and masks only where given.
 
-Levenberg–Marquardt from coarse images to fine ones. As in DIST (Liu et al., CVPR 2020, section 4.3) the shape and a
-similarity are fitted together, from several starts.
+Multi-start Levenberg–Marquardt, from coarse images to fine ones. As in DIST (Liu et al., CVPR 2020, section 4.3) the
+shape and a similarity are fitted together.
 """
 
-import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from itertools import islice
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace.data.photograph import Photograph
 from distrace.fields.decoder import Decoder
-from distrace.fitting.multistart import Starts, Step, best_of, stages_of
 from distrace.fitting.solver import SolverConfig, charbonnier, minimise
 from distrace.photos.initialisation import Initialiser
-from distrace.photos.pyramid import PyramidLevel
-from distrace.photos.residuals import ComparisonConfig, PlacedShape
-from distrace.photos.selection import inconsistencies
+from distrace.photos.judge import inconsistencies
+from distrace.photos.photo_set import PhotoSet
+from distrace.photos.problem import ComparisonConfig, PlacedShape
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
@@ -26,50 +25,73 @@ PLACEMENT = -1  # `start` of the steps that find the placement
 
 
 @dataclass(frozen=True)
-class PhotoConfig(Starts):
-    """The schedule. Each start is tried up to the finest level: coarse images do not tell which start is best."""
+class PhotoConfig:
+    """The schedule, in rounds of a few iterations on the same rays; each round draws new ones."""
 
-    iterations: int = 72
+    rounds: int = 18
+    coarse_rounds: int = 4  # the first of each start, with images of half the size; a trial ends with fine ones
+    iterations: int = 4  # of each round
     starts: int = 4
-    trial: int = 24
-    place_iterations: int = 24  # of the mean shape, before all starts, where the placement is unknown
-    levels: tuple[float, ...] = (*4 * (0.5,), *14 * (1.0,))  # factors of the images' size, each with new rays
+    trial_rounds: int = 6  # of each start, before the best one goes on
+    place_rounds: int = 6  # of the mean shape, before all starts, where the placement is unknown
     comparison: ComparisonConfig = ComparisonConfig()
-    outline_scale: float = 0.06  # of outline residuals, in radii, at the first level …
-    outline_decay: float = 0.6  # … × this from one level to the next, …
+    outline_scale: float = 0.06  # of outline residuals, in radii, in the first round …
+    outline_decay: float = 0.6  # … × this from one round to the next, …
     outline_least: float = 0.005  # … and no less than this
     damping: float = 0.1
+    seed: int = 0
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.place_iterations < 1:
-            raise ValueError(f"{self.place_iterations} iterations were given for the placement; at least 1 is needed")
-        if not self.levels or not all(0 < level <= 1 for level in self.levels):
-            raise ValueError(f"levels {self.levels} were given; each is a part of the images' size, up to 1")
+        least = min(self.rounds, self.iterations, self.starts, self.trial_rounds, self.place_rounds)
+        if least < 1:
+            raise ValueError(f"{self} was given; rounds, iterations and starts must each be at least 1")
+
+    @property
+    def tried(self) -> int:
+        """Rounds of each start before the choice; the best has at least one left."""
+        return min(self.trial_rounds, self.rounds - 1) if self.starts > 1 else 0
 
     @property
     def total(self) -> int:
         """Iterations of all starts, and of the placement."""
-        return super().total + (min(self.place_iterations, self.iterations) if self.comparison.fit_place else 0)
+        placement = min(self.place_rounds, self.rounds) if self.comparison.fit_place else 0
+        return self.iterations * (placement + self.tried * (self.starts - 1) + self.rounds)
 
 
 UNKNOWN_PLACE = PhotoConfig()
-KNOWN_PLACE = PhotoConfig(
-    iterations=48, levels=(*4 * (0.5,), *8 * (1.0,)), comparison=ComparisonConfig(fit_place=False)
-)
-"""For a shape that lies as the model's do: its code alone takes fewer iterations."""
+KNOWN_PLACE = PhotoConfig(rounds=12, comparison=ComparisonConfig(fit_place=False))
+"""For a shape that lies as the model's do: its code alone takes fewer rounds."""
 
 
 @dataclass(frozen=True)
-class PhotoStep(Step):
+class PhotoStep:
     """The code and the placement after an iteration."""
 
-    place: Similarity = field(default_factory=Similarity.identity)
-    searched: int = 0  # of the evaluations, those of the initialisation
+    start: int
+    iteration: int
+    loss: float
+    terms: dict[str, float]
+    code: Float[Tensor, "length"]
+    place: Similarity
 
     @property
     def name(self) -> str:
-        return "placement" if self.start == PLACEMENT else super().name
+        """What it is a step of."""
+        return "placement" if self.start == PLACEMENT else f"start {self.start + 1}"
+
+
+@dataclass
+class PhotoFit:
+    """All steps of a fit, of which the last is the result, and the evaluations of the field that they took."""
+
+    steps: list[PhotoStep] = field(default_factory=list)
+    evaluations: int = 0
+    setup_evaluations: int = 0  # of these, those of the initialisation
+
+    @property
+    def last(self) -> PhotoStep:
+        """The result."""
+        return self.steps[-1]
 
 
 def fit_photos(
@@ -78,103 +100,81 @@ def fit_photos(
     prior: Prior,
     config: PhotoConfig = UNKNOWN_PLACE,
     place: Similarity | None = None,
-) -> Iterator[PhotoStep]:
-    """Fits a shape to photographs whose cameras see the unit sphere, on the prior's device; yields every step.
+    callback: Callable[[PhotoStep], None] = lambda step: None,
+) -> PhotoFit:
+    """Fits a shape to photographs whose cameras see the unit sphere, on the prior's device.
 
     An unknown placement is fitted first, with the mean shape, from `place` (by default the identity) or from
-    `Initialiser.locate`, whichever contradicts the photographs less. Then all starts begin there: the mean shape, the
-    training shapes of the least loss, and a draw from the prior. The start with the least inconsistency goes on,
-    and its last step is the result. Raises `ValueError` for fewer than two photographs.
+    `Initialiser.locate`, whichever contradicts the photographs less: in a wrong place wrong training shapes fit best.
+    Then all starts begin there: the mean shape, the training shapes of the least loss, and a draw from the prior. The
+    start with the least inconsistency goes on, and its last step is the result. `callback` receives every step.
+
+    Raises `ValueError` for fewer than two photographs.
     """
     if len(photographs) < 2:
         raise ValueError(f"{len(photographs)} photographs were given; colours are compared between two at least")
     device = prior.mean.device
-    moved = [photograph.to(device) for photograph in photographs]
-    levels = {factor: PyramidLevel.of(moved, factor, config.comparison) for factor in sorted(set(config.levels))}
-    fit = _Fit(decoder, prior, config, [levels[factor] for factor in config.levels])
-    return fit.steps((place or Similarity.identity()).to(device))
+    views = [photograph.to(device) for photograph in photographs]
+    fine = PhotoSet(decoder, views, prior, config.comparison)
+    coarse = PhotoSet(decoder, [view.resized(0.5) for view in views], prior, config.comparison)
+    levels = [coarse if number < config.coarse_rounds else fine for number in range(config.rounds)]
+    initialiser = Initialiser(levels[0], config.seed)
+    place = (place or Similarity.identity()).to(device)
+    fit = PhotoFit()
+
+    if config.comparison.fit_place:
+        place = initialiser.likelier([place, initialiser.locate(fine, place)])
+        mean_shape = _Descent(PLACEMENT, PlacedShape(initialiser.mean_shape, place), config)
+        mean_shape.run(levels, config.place_rounds, fit, callback)
+        place = mean_shape.shape.place
+
+    starts = initialiser.starts(place, config.starts)
+    descents = [_Descent(start, PlacedShape(w, place), config) for start, w in enumerate(starts)]
+    best = 0
+    if config.tried:
+        for descent in descents:
+            descent.run(levels, config.tried, fit, callback)
+        verdicts, evaluations = inconsistencies(fine, [descent.shape for descent in descents], config.seed)
+        fit.evaluations += evaluations
+        best = min(range(len(verdicts)), key=lambda start: verdicts[start])
+    descents[best].run(levels, config.rounds, fit, callback)
+    fit.setup_evaluations = initialiser.evaluations
+    fit.evaluations += initialiser.evaluations
+    return fit
 
 
-@dataclass(frozen=True)
-class _Fit:
-    """What all starts share."""
+class _Descent:
+    """One start on its way down, which can be interrupted between rounds."""
 
-    decoder: Decoder
-    prior: Prior
-    config: PhotoConfig
-    levels: Sequence[PyramidLevel]
+    def __init__(self, start: int, shape: PlacedShape, config: PhotoConfig) -> None:
+        self.start = start
+        self.shape = shape
+        self.config = config
+        self.expected_place = shape.place
+        self.damping = config.damping
+        self.random = torch.Generator().manual_seed(config.seed)
+        self.rounds = 0
 
-    def steps(self, place: Similarity) -> Iterator[PhotoStep]:
-        """The steps of the placement, where it is unknown, and of all starts."""
+    def run(
+        self, levels: Sequence[PhotoSet], rounds: int, fit: PhotoFit, callback: Callable[[PhotoStep], None]
+    ) -> None:
+        """Goes on until so many rounds of it are done, as far as there are levels, one for each round."""
         config = self.config
-        if config.comparison.fit_place:
-            for step in self._fit_place(place):
-                yield step
-                place = step.place
-        began = time.perf_counter()
-        initialiser = Initialiser(self.decoder, self.prior, config.seed)
-        starts = initialiser.starts(self.levels[0], config.comparison, place, config.starts)
-        steps = best_of(config, lambda start: self._fit(start, PlacedShape(starts[start], place)), self._judged)
-        yield from _charged(steps, initialiser, time.perf_counter() - began)
-
-    def _fit_place(self, place: Similarity) -> Iterator[PhotoStep]:
-        """Fits the mean shape: in a wrong place wrong training shapes fit best."""
-        began = time.perf_counter()
-        config = self.config
-        initialiser = Initialiser(self.decoder, self.prior, config.seed)
-        places = (place, initialiser.locate(self.levels[-1], place))
-        place = initialiser.likelier(self.levels[0], config.comparison, places)
-        seconds = time.perf_counter() - began
-        steps = self._fit(PLACEMENT, PlacedShape(self.prior.start(0, config.seed), place))
-        yield from _charged(islice(steps, config.place_iterations), initialiser, seconds)
-
-    def _fit(self, start: int, shape: PlacedShape) -> Iterator[PhotoStep]:
-        """The steps of one start, level by level."""
-        config = self.config
-        prior = self.prior
-        expected_place = shape.place
-        damping = config.damping
-        random = torch.Generator().manual_seed(config.seed)
-        iteration = 0
-        began = time.perf_counter()
-        for number, iterations in stages_of(config.iterations, len(self.levels)):
-            level = self.levels[number]
-            sample = level.sample(self.decoder, prior, shape, config.comparison.rays, random)
-            problem, state = level.problem(sample, config.comparison)
-            problem.expected_place = expected_place
+        for number in range(self.rounds, min(rounds, len(levels))):
+            photos = levels[number]
+            sample = photos.sample(self.shape, config.comparison.rays, self.random)
+            problem, state = photos.problem(sample)
+            problem.expected_place = self.expected_place
             problem.outline_scale = max(config.outline_scale * config.outline_decay**number, config.outline_least)
-            solver = SolverConfig(iterations, damping, even=True, kernel=charbonnier, settled=0.0)
-            counted = 0
+            solver = SolverConfig(config.iterations, self.damping, even=True, kernel=charbonnier, settled=0.0)
             for solution in minimise(problem.residuals, state, problem.retract, solver):
-                shape = solution.state.shape
-                damping = solution.damping
-                iteration += 1
+                self.shape = solution.state.shape
+                self.damping = solution.damping
                 terms = problem.terms(solution.state, solution.residuals)
-                loss = sum(terms.values())
-                seconds = time.perf_counter() - began
-                evaluations = problem.evaluations - counted
-                code = prior.code(shape.w)
-                yield PhotoStep(start, iteration, loss, terms, code, seconds, evaluations, place=shape.place)
-                began = time.perf_counter()
-                counted = problem.evaluations
-
-    def _judged(self, trials: Sequence[Sequence[PhotoStep]]) -> list[PhotoStep]:
-        """The trials' last steps with their inconsistencies as verdicts."""
-        began = time.perf_counter()
-        last = [trial[-1] for trial in trials]
-        shapes = [PlacedShape(self.prior.coordinates(step.code), step.place) for step in last]
-        comparison = self.config.comparison
-        found = inconsistencies(self.levels[-1], self.decoder, self.prior, shapes, comparison, self.config.seed)
-        seconds = (time.perf_counter() - began) / len(last)
-        return [
-            replace(step, verdict=verdict, seconds=seconds, evaluations=evaluations)
-            for step, (verdict, evaluations) in zip(last, found, strict=True)
-        ]
-
-
-def _charged(steps: Iterator[PhotoStep], initialiser: Initialiser, seconds: float) -> Iterator[PhotoStep]:
-    """The steps, of which the first is charged with the initialisation's time and evaluations."""
-    step = next(steps)
-    evaluations = step.evaluations + initialiser.evaluations
-    yield replace(step, seconds=step.seconds + seconds, evaluations=evaluations, searched=initialiser.evaluations)
-    yield from steps
+                iteration = number * config.iterations + solution.iteration
+                code = photos.prior.code(self.shape.w)
+                step = PhotoStep(self.start, iteration, sum(terms.values()), terms, code, self.shape.place)
+                fit.steps.append(step)
+                callback(step)
+            fit.evaluations += problem.evaluations
+            self.rounds = number + 1

@@ -12,7 +12,7 @@ from distrace.checkpoints.model import Model
 from distrace.data.photograph import Photograph
 from distrace.fitting.ray_sampling import band
 from distrace.photos.fit_photos import PhotoStep
-from distrace.photos.selection import ViewAgreement
+from distrace.photos.judge import ViewAgreement
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
 from distrace.report.completion_page import View

@@ -1,4 +1,4 @@
-"""Residuals of a placed shape before photographs: colours that differ between views, and wrong silhouettes.
+"""The least-squares problem of a placed shape before photographs: residuals, and their Jacobian.
 
 A surface point that one view sees is looked up in others (Liu et al., CVPR 2020, section 3.4; Lin et al., *Photometric
 Mesh Optimization*, CVPR 2019). Its derivatives are exact: by the implicit function theorem the point slides along its
@@ -23,13 +23,10 @@ from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
-RESTART_MARGIN = 0.05  # radii before its last hit at which a ray's next trace starts
-NEAR_MISS = 0.03  # background rays that come closer than this to the surface get their least value searched
-LEAST_SLOPE = 0.2  # bound on |∇f · v|, so that points at grazing rays do not slide too far
-OUTLINE_SATURATION = 3.0  # × the outline scale: residuals beyond it hardly pull
-MINIMUM_REACH = 0.05  # radii, and …
-MINIMUM_ROUNDS = 2  # … rounds, of the search for a ray's least value
-PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # of rotation, translation and log scale: radians, radii, 1
+NEARBY = 0.05  # radii: an iteration moves the surface less
+LEAST_SLOPE = 0.2  # of |∇f · v|: at grazing rays points slide farther than the linearisation holds
+OUTLINE_SATURATION = 3.0  # × the outline scale: beyond it a label is wrong rather than the shape
+PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # prior: rotation (radians), translation (radii), log scale
 MARCH = TraceConfig(tolerance=1e-3, steps=50, least_step=2e-3)
 
 
@@ -52,19 +49,6 @@ class ComparisonConfig:
         if self.rays < 1 or self.neighbours < 1:
             given = f"{self.rays} rays and {self.neighbours} neighbours"
             raise ValueError(f"{given} were asked for; both must be at least 1")
-
-
-@dataclass(frozen=True)
-class RayObservations:
-    """World rays of all views, and what the photographs show there."""
-
-    rays: Rays
-    view: Int[Tensor, "n"]
-    colour: Float[Tensor, "n channels"]
-    label: Float[Tensor, "n"]  # the certainty of the object, up to 1, or of the background, down to −1; 0: unknown
-
-    def __getitem__(self, rows: Tensor) -> "RayObservations":
-        return RayObservations(self.rays[rows], self.view[rows], self.colour[rows], self.label[rows])
 
 
 @dataclass(frozen=True)
@@ -91,10 +75,13 @@ class PhotoProblem:
 
     decoder: Decoder
     prior: Prior
-    observations: RayObservations
-    images: Sequence[GradientImage]
-    pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     config: ComparisonConfig
+    images: Sequence[GradientImage]
+    rays: Rays  # in the world, of all views
+    view: Int[Tensor, "n"]
+    colour: Float[Tensor, "n channels"]
+    label: Float[Tensor, "n"]  # the certainty of the object, up to 1, or of the background, down to −1; 0: unknown
+    pairs: Int[Tensor, "pairs 2"]  # a ray, and another view in which its point is looked up
     expected_place: Similarity  # the mean of the placement's prior
     outline_scale: float = 0.02  # radii: larger outline residuals count linearly
     evaluations: int = 0
@@ -102,21 +89,20 @@ class PhotoProblem:
     @torch.no_grad()
     def trace(self, shape: PlacedShape, previous: TracedShape | None = None) -> TracedShape:
         """Traces all rays; those that hit `previous` start shortly before that hit."""
-        rays = shape.place.rays_in_object(self.observations.rays)
-        label = self.observations.label
+        rays = shape.place.rays_in_object(self.rays)
         bounds = meet_sphere(rays)
         start = bounds.near
         if previous is not None:
-            start = torch.where(previous.hit, previous.distance - RESTART_MARGIN, start)
+            start = torch.where(previous.hit, previous.distance - NEARBY, start)
         sdf = Counted(self.decoder.field(self.prior.code(shape.w)))
         trace = sphere_trace(sdf, rays, bounds, MARCH, start)
         to_centre = -(rays.origins * rays.directions).sum(-1)  # for rays that miss the unit sphere
         distance = torch.where(bounds.meets, trace.closest, to_centre)
-        wrong = bounds.meets & torch.where(trace.hit, label < 0, label > 0)
-        background = (bounds.meets & ~trace.hit & (label < 0)).nonzero()[:, 0]
-        wrong[background] = sdf(rays[background].at(distance[background])) < NEAR_MISS
+        wrong = bounds.meets & torch.where(trace.hit, self.label < 0, self.label > 0)
+        background = (bounds.meets & ~trace.hit & (self.label < 0)).nonzero()[:, 0]
+        wrong[background] = sdf(rays[background].at(distance[background])) < NEARBY
         within = Bounds(bounds.near[wrong], bounds.far[wrong])
-        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=MINIMUM_REACH, refine=MINIMUM_ROUNDS)
+        distance[wrong] = minimum(sdf, rays[wrong], distance[wrong], within, reach=NEARBY, refine=2)
         self.evaluations += sdf.evaluations
         return TracedShape(shape, distance, trace.hit, wrong)
 
@@ -129,24 +115,27 @@ class PhotoProblem:
 
     def residuals(self, state: TracedShape) -> Residuals:
         """Colour differences, field values at wrong silhouettes, and the prior's residuals, in this order."""
-        rows = torch.cat([self.pairs[:, 0].unique(), state.wrong.nonzero()[:, 0]]).unique()
+        rows = torch.cat([self.pairs[:, 0], state.wrong.nonzero()[:, 0]]).unique()
         points = self._linearise(state, rows)
         parts = [self._colours(state, points), self._outlines(state, points), self._prior(state)]
-        return Residuals(*(torch.cat(part) for part in zip(*((p.values, p.jacobian, p.weights) for p in parts))))
+        return Residuals(
+            torch.cat([part.values for part in parts]),
+            torch.cat([part.jacobian for part in parts]),
+            torch.cat([part.weights for part in parts]),
+        )
 
     def terms(self, state: TracedShape, residuals: Residuals) -> dict[str, float]:
         """The robust loss of each kind of residual."""
+        losses = residuals.weights * charbonnier(residuals.values.square())[0] / 2
         colours = 3 * len(self.pairs)
-        outlines = int(state.wrong.sum())
-        sizes = [colours, outlines, len(residuals.values) - colours - outlines]
-        parts = zip(*(each.split(sizes) for each in (residuals.values, residuals.jacobian, residuals.weights)))
-        losses = [Residuals(*part).loss(1.0, charbonnier) for part in parts]
-        return dict(zip(("colour", "outline", "code"), losses, strict=True))
+        outlines = colours + int(state.wrong.sum())
+        parts = {"colour": losses[:colours], "outline": losses[colours:outlines], "code": losses[outlines:]}
+        return {name: float(part.sum()) for name, part in parts.items()}
 
     def _linearise(self, state: TracedShape, rows: Int[Tensor, "rays"]) -> "_SurfacePoints":
         """Points on some rays, with the field's values and derivatives."""
         place = state.shape.place
-        rays = self.observations.rays[rows]
+        rays = self.rays[rows]
         points = place.rays_in_object(rays).at(state.distance[rows])
         values, gradient, by_code = derivatives(self.decoder, points, self.prior.code(state.shape.w))
         self.evaluations += len(values)
@@ -171,8 +160,8 @@ class PhotoProblem:
             image = self.images[view]
             pixels, by_point = image.project(points.points_world[rows[in_view]])
             colours, gradients = image.at(pixels)
-            values[in_view] = colours - self.observations.colour[rays[in_view]]
-            motion = (by_point * self.observations.rays.directions[rays[in_view], None]).sum(-1)
+            values[in_view] = colours - self.colour[rays[in_view]]
+            motion = (by_point * self.rays.directions[rays[in_view], None]).sum(-1)
             along_ray[in_view] = (gradients * motion[:, None]).sum(-1)
         slope = points.slope[rows]
         slide = -points.scale / slope.clamp_max(-LEAST_SLOPE) * (state.hit[rays] & (slope < 0))
@@ -188,7 +177,7 @@ class PhotoProblem:
         """
         wrong = state.wrong.nonzero()[:, 0]
         rows = points.row_of_ray[wrong]
-        label = self.observations.label[wrong]
+        label = self.label[wrong]
         least = points.values[rows]
         excess = torch.where(label > 0, least.clamp_min(0), (least - self.config.margin).clamp_max(0))
         excess = excess / self.outline_scale
