@@ -9,10 +9,10 @@ import torch
 from distrace.camera import Camera
 from distrace.data.observation import pictured
 from distrace.data.solid import Solid
-from distrace.fitting.methods import told
 from distrace.report.charts import steps_chart
 from distrace.report.page import Html, figure, page, paragraph, section, table
 from distrace.shading import Picture, grid
+from experiments.tables.methods import told
 from experiments.tables.sparse_depth import DENSITIES, SIZE, Done, camera_of, observed, surface_of, true_solid
 from experiments.tables.trials import Place, grouped
 

@@ -56,9 +56,7 @@ def observed_of(model: Model, seen: View | Cloud, prior: Prior) -> Observed:
     return Observed.of_points(torch.cat(sides))
 
 
-def signed_samples(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], offset: float
-) -> Float[Tensor, "n 4"]:
+def signed_samples(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], offset: float) -> Float[Tensor, "n 4"]:
     """Returns points moved along normals of the surface, and their distances from it."""
     return torch.cat([points + offset * normals, torch.full_like(points[:, :1], offset)], dim=1)
 

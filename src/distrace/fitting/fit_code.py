@@ -12,7 +12,7 @@ from distrace.data.observation import View
 from distrace.data.scan import canonical_scan
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
-from distrace.fitting.ray_sampling import Pool, Targets, drawn, pools_of
+from distrace.fitting.ray_sampling import Targets, drawn, pools_of
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample
 from distrace.fitting.solver import SolverConfig, cauchy
@@ -23,6 +23,7 @@ from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
+
 
 @dataclass(frozen=True)
 class CodeFitConfig:

@@ -48,7 +48,7 @@ class Pool:
         return Pool(view, with_depth, outline, anywhere)
 
     def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator) -> Targets:
-        """Returns at most so many rays with a depth, and as many of the silhouette: half at its outline, half anywhere."""
+        """Returns at most so many rays with a depth, and of the silhouette: half at its outline, half anywhere."""
         sets = ((self.with_depth, depth_rays), (self.outline, mask_rays // 2), (self.anywhere, mask_rays // 2))
         chosen = torch.cat([drawn(indices, count, random) for indices, count in sets])
         view = self.view
