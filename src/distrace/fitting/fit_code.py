@@ -22,6 +22,7 @@ from distrace.prior import START_DEVIATION, Prior
 from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
+TELLING = 1000  # depths of a view: fewer lie so far apart that the shape's bends look like noise
 SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
 
 
@@ -79,8 +80,13 @@ class Observed:
     def of_views(decoder: Decoder, views: Sequence[View], prior: Prior) -> "Observed":
         """Raises `ValueError` without views, or with one from inside the mean shape."""
         pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-        noise = max(canonical_scan(view.to("cpu")).noise for view in views)
-        return Observed(lambda points, rays, random: _sample([p.draw(points, rays, random) for p in pools]), noise)
+        dense = [view.to("cpu") for view in views if int(view.seen.sum()) >= TELLING]
+        noise = max((canonical_scan(view).noise for view in dense), default=0.0)
+
+        def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
+            return _sample([pool.draw(points, rays, random) for pool in pools])
+
+        return Observed(draw, noise)
 
     @staticmethod
     def of_points(samples: Float[Tensor, "n 4"]) -> "Observed":
