@@ -158,10 +158,9 @@ def plausible_codes(
     optimise: Bardsley et al., SIAM J. Sci. Comput. 2014).
     """
     random = torch.Generator().manual_seed(config.seed)
-    bases = [prior.code(prior.draw(random, START_DEVIATION)) for _ in range(count)]
+    bases = [prior.code(prior.draw(random, START_DEVIATION)) for _ in range(2 * count)]  # half may end far off
     states = [PlacedCode(k, base, torch.zeros_like(base), _identity(prior)) for k, base in enumerate(bases)]
-    all_of_them = replace(config, starts=count, finalists=count)
-    ends = minimised(decoder, observed, prior, states, all_of_them, None)
+    ends = minimised(decoder, observed, prior, states, replace(config, starts=len(states), finalists=count), None)
     return [state.code(prior) for state in ends.states], ends.evaluations
 
 
