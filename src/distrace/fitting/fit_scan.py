@@ -102,4 +102,3 @@ def _likely(state: PlacedCode, scan: Scan) -> Start:
     axis = state.place.rotation[:, 1]
     up = scan.ups[(scan.ups @ axis).argmax()] if len(scan.ups) else None
     return Start(float(state.place.scale), up)
-

@@ -15,7 +15,6 @@ from distrace.rays import meet_sphere
 
 FREE = 3.0  # weight of the depth inside of points that are free, which few are, against distances of surface points
 SCREENS = (16, 4, 1)  # one in so many points is compared with all codes, more of them with the quarter that is left
-AT_ONCE = 8192  # points, of several codes
 
 
 @dataclass(frozen=True)
@@ -45,9 +44,7 @@ class Hints:
         """How far each shape is from the hints, in the mean; every `step`-th of them is compared."""
         points = self.points[::step]
         distances = self.distances[::step]
-        parts = codes.split(max(AT_ONCE // max(len(points), 1), 1))
-        values = torch.cat([decoder.fields(part)(points.expand(len(part), -1, -1)) for part in parts])
-        values = values.clamp(-FAR, FAR)
+        values = decoder.fields(codes)(points.expand(len(codes), -1, -1)).clamp(-FAR, FAR)
         free = distances.isinf()
         off = (values - distances.clamp(-FAR, FAR)).abs()[:, ~free]
         inside = (-values[:, free]).clamp_min(0)
