@@ -23,6 +23,7 @@ from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
 TELLING = 1000  # depths of a view: fewer lie so far apart that the shape's bends look like noise
+SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
 
 
@@ -34,7 +35,7 @@ class CodeFitConfig:
     finalists: int = 3
     iterations: int = 16  # of the best start, of which three eighths are in the first round
     points: int = 500  # of each view, in the second round; a fifth in the first one
-    rays: int = 600  # the same; a third in the first round
+    rays: int = 400  # the same; a third in the first round
     deviation: float = 0.006  # of a shape that the model represents from the observation, in radii of the unit sphere
     seed: int = 0
 
@@ -48,8 +49,8 @@ class CodeFitConfig:
         """The rounds, the last of which is never empty."""
         first = self.iterations * 3 // 8
         every = 1 << 20  # dimensions: all that the prior has
-        rough = Round(self.starts, first, every, self.points // 5, self.rays // 3, 8, 3 * self.deviation)
-        fine = Round(self.finalists, self.iterations - first, every, self.points, self.rays, 10, self.deviation)
+        rough = Round(self.starts, first, every, self.points // 5, self.rays // 3, SAMPLES, 3 * self.deviation)
+        fine = Round(self.finalists, self.iterations - first, every, self.points, self.rays, SAMPLES, self.deviation)
         return (rough, fine) if first else (fine,)
 
     @property
