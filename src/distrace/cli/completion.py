@@ -98,7 +98,7 @@ def complete(run: Run, task: Task) -> Verdict:
 
 def _outcome(task: Task, fit: CodeFit) -> Outcome:
     """Returns the surface and the other completions. Raises `ValueError` for a field without a zero."""
-    others: list[Float[Tensor, length]] = []
+    others: list[Tensor] = []
     evaluations = fit.evaluations
     if task.plausible:
         config = CodeFitConfig(seed=task.fit.seed)
