@@ -21,12 +21,11 @@ NORMAL_OFFSET = 0.01  # radii from a point along its normal, of the two samples 
 def complete_shape(
     model: Model, seen: View | Cloud, config: FitConfig | CodeFitConfig, progress: Progress | None = None
 ) -> CodeFit:
-    """Returns the code that fits; by Levenberg–Marquardt, or from a view by Adam. Runs on the model's device."""
+    """Returns the code that fits, by Levenberg–Marquardt or, from a view, by Adam. Runs on the model's device."""
     prior = prior_of(model.codes)
-    if isinstance(config, CodeFitConfig):
-        return fit_observed(model.decoder, observed_of(model, seen, prior), prior, config, progress)
-    if isinstance(seen, Cloud):
-        raise ValueError("a cloud was given to Adam, which fits views; use the solver lm")
+    if isinstance(config, CodeFitConfig) or isinstance(seen, Cloud):
+        settings = config if isinstance(config, CodeFitConfig) else CodeFitConfig(seed=config.seed)
+        return fit_observed(model.decoder, observed_of(model, seen, prior), prior, settings, progress)
     steps = []
     for step in fit_shape(model.decoder, [seen.to(model.codes.device)], prior, config):
         steps.append(step)

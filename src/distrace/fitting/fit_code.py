@@ -85,7 +85,7 @@ class Observed:
         noise = max((canonical_scan(view).noise for view in dense), default=0.0)
 
         def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
-            return _sample([pool.draw(points, rays, random) for pool in pools])
+            return _sample([pool.draw(points, rays, random) for pool in pools], 2 * noise)
 
         return Observed(draw, noise)
 
@@ -189,8 +189,8 @@ def _identity(prior: Prior) -> Similarity:
     return Similarity.identity().to(prior.mean.device)
 
 
-def _sample(targets: Sequence[Targets]) -> ScanSample:
-    """Returns points at depths, rays that are free up to these or beside the object, and rays that meet it."""
+def _sample(targets: Sequence[Targets], before: float) -> ScanSample:
+    """Returns points at depths, rays that are free until `before` these or beside the object, and rays that meet it."""
     points = []
     free: list[Rays] = []
     until = []
@@ -202,7 +202,7 @@ def _sample(targets: Sequence[Targets]) -> ScanSample:
         points.append(rays.at(distance)[known])
         is_free = known | ~target.is_object
         free.append(rays[is_free])
-        until.append(distance[is_free])
+        until.append(distance[is_free] - before)
         hits.append(rays[target.is_object & ~known])
     every = [*free, *hits]
     rays = Rays(torch.cat([each.origins for each in every]), torch.cat([each.directions for each in every]))
