@@ -17,14 +17,14 @@ from distrace.data.observation import View
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, save_photographs
 from distrace.data.placement import Placement
-from distrace.fitting import methods
-from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
-from distrace.fitting.fit_samples import SampleFitConfig
-from distrace.fitting.methods import CLOUDS, METHODS, steps_of, told
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.render import render
 from distrace.report import views_page
 from distrace.training.config import TrainConfig
+from experiments.baselines.deepsdf import SampleFitConfig
+from experiments.tables import methods
+from experiments.tables.methods import CLOUDS, METHODS, completed_by, told
 
 Command = Callable[..., None]
 
@@ -93,11 +93,11 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
         seen = render(load_model(model).field(1), camera)
         view = View(camera, seen.depth, seen.mask, seen.normal)
     monkeypatch.setattr(methods, "DEEPSDF", SampleFitConfig(samples=100, iterations=3))
-    for config in (CodeFitConfig(iterations=1, starts=1, stages=1), FitConfig(iterations=2, starts=1)):
+    for config in (CodeFitConfig(iterations=1, starts=1), FitConfig(iterations=2, starts=1)):
         with pretended(monkeypatch):
-            *_, last = steps_of(load_model(model).to("meta"), told(view, method), method, config)
-            assert last.code.device == DEVICE
-            assert last.code.cpu().isfinite().all()
+            fit = completed_by(method, load_model(model).to("meta"), told(view, method), config)
+            assert fit.code.device == DEVICE
+            assert fit.code.cpu().isfinite().all()
 
 
 @pytest.fixture

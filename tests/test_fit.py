@@ -3,7 +3,6 @@
 from collections.abc import Iterator
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 from spheres import Spheres
@@ -12,10 +11,7 @@ from torch import Tensor
 from distrace import losses
 from distrace.camera import Camera
 from distrace.data.observation import View
-from distrace.fields.primitives import sphere
-from distrace.fitting.fit import FitConfig, fit_shape, view_terms
-from distrace.fitting.fit_samples import SampleFitConfig, around_points, fit_samples
-from distrace.fitting.multistart import Step
+from distrace.fitting.fit import FitConfig, Step, fit_shape, view_terms
 from distrace.fitting.ray_sampling import OUTLINE, Pool, Targets
 from distrace.prior import LEAST_DEVIATION, Prior, prior_of
 from distrace.rays import Rays, meet_sphere
@@ -129,11 +125,9 @@ def test_a_fit_of_no_iterations_or_no_starts_is_refused(wrong: dict) -> None:
         FitConfig(**wrong)
 
 
-def test_a_fit_without_views_or_samples_is_refused() -> None:
+def test_a_fit_without_views_is_refused() -> None:
     with pytest.raises(ValueError, match="no view was given"):
         next(fit_shape(Spheres(), [], PRIOR))
-    with pytest.raises(ValueError, match="no samples were given"):
-        next(fit_samples(Spheres(), torch.empty(0, 4)))
 
 
 def test_a_view_from_inside_the_mean_shape_is_refused() -> None:
@@ -268,25 +262,3 @@ def test_directions_in_which_no_code_varies_stay_open_and_one_code_has_the_prior
     alone = prior_of(codes[:1])
     assert torch.equal(alone.basis, 0.1 * torch.eye(4))
     assert torch.equal(alone.mean, torch.zeros(4))
-
-
-def sphere_samples(code: Tensor, count: int = 2000) -> Tensor:
-    points = torch.from_numpy(np.random.default_rng(0).uniform(-0.8, 0.8, (count, 3))).float()
-    return torch.cat([points, sphere(code[0], code[1:])(points)[:, None]], dim=1)
-
-
-def test_a_sphere_is_recovered_from_signed_samples() -> None:
-    config = SampleFitConfig(iterations=300, samples=500)
-    step = last(fit_samples(Spheres(), sphere_samples(TRUE), config))
-    torch.testing.assert_close(step.code, TRUE, atol=0.02, rtol=0)
-    assert step.iteration == 300
-    assert step.terms["distance"] < 0.005
-
-
-def test_points_with_normals_become_samples_on_both_sides() -> None:
-    view = view_of(TRUE, normal=True)
-    assert view.normal is not None
-    samples = around_points(view.points(), view.normal[view.seen], 0.02)
-    assert len(samples) == 2 * int(view.seen.sum())
-    torch.testing.assert_close(sphere(TRUE[0], TRUE[1:])(samples[:, :3]), samples[:, 3], atol=1e-5, rtol=0)
-    assert set(samples[:, 3].abs().mul(1000).round().tolist()) == {20.0}

@@ -1,5 +1,7 @@
 """Residuals of a placed shape: their derivatives, and what each kind of observation contributes."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -101,3 +103,20 @@ def test_beyond_the_sphere_the_distance_to_it_is_added() -> None:
     direction = torch.nn.functional.normalize(torch.tensor([[1.0, 2.0, -2.0]]).double(), dim=-1)
     values, _, _ = extended(fit.decoder, torch.cat([direction, 3 * direction]), state.code(fit.prior))
     torch.testing.assert_close(values[1], values[0] + 2)
+
+
+def test_signed_distances_are_met_and_far_ones_only_tell_the_side() -> None:
+    fit, state = problem(points_about(PLACE, 0.7), *nothing(), 0, moves=False)
+    with torch.no_grad():
+        values = fit.decoder.field(state.code(fit.prior))(state.place.to_object(fit.sample.points))
+    fit.sample = replace(fit.sample, distances=torch.full((40,), 0.05).double())
+    (near,) = fit.residuals([state])
+    torch.testing.assert_close(near.values[:40] * fit.deviation, state.place.scale * values - 0.05)
+    fit.decoder.lin3.bias.data += 3.0  # all is far outside
+    fit.sample = replace(fit.sample, distances=torch.full((40,), 5.0).double())
+    (right,) = fit.residuals([state])
+    assert (right.values[:40] == 0).all()
+    assert (right.jacobian[:40] == 0).all()
+    fit.sample = replace(fit.sample, distances=torch.full((40,), -5.0).double())
+    (wrong,) = fit.residuals([state])
+    assert (wrong.values[:40] > 0).all()

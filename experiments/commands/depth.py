@@ -11,12 +11,12 @@ import tyro
 from distrace.cli.common import show_table
 from distrace.cli.console import console, origin, progress, start
 from distrace.files import save_text
-from distrace.fitting.methods import METHODS
 from distrace.processes import each_done
 from experiments.datasets.splits import CLASSES, Meshes
 from experiments.tables import depth_tables
 from experiments.tables.clip_page import save_clip_page
 from experiments.tables.focal import Rendering, rendering_rows, renderings_of
+from experiments.tables.methods import METHODS
 from experiments.tables.multiview import METHODS as METHODS_OF_CLIPS
 from experiments.tables.multiview import ClipTrial, clip_done, described, multiview_rows, settings_of
 from experiments.tables.sparse_depth import (

@@ -9,13 +9,13 @@ from distrace import shading
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
 from distrace.files import save_json, save_text
-from distrace.fitting.continuation import CodeFitConfig
-from distrace.fitting.methods import METHODS
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.processes import each_done
 from distrace.report.page import figure, page, section, table
 from experiments.datasets.splits import Meshes, on_side
 from experiments.tables import pose as pose_table
 from experiments.tables.completion import (
+    METHODS,
     Result,
     completion_results,
     held_out_results,

@@ -14,11 +14,9 @@ from distrace.checkpoints.model import Model
 from distrace.data.observation import View, observe
 from distrace.data.shapes import Shape
 from distrace.data.solid import solid_of
-from distrace.fitting.code_residuals import Comparison
-from distrace.fitting.continuation import CodeFitConfig
-from distrace.fitting.fit import FitConfig, fit_shape, view_terms
-from distrace.fitting.fit_code import fit_code
-from distrace.fitting.multistart import Step
+from distrace.fields.decoder import Decoder
+from distrace.fitting.fit import FitConfig, Step, fit_shape, view_terms
+from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.fitting.ray_sampling import Pool
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
@@ -26,8 +24,7 @@ from distrace.prior import Prior, prior_of
 from experiments.tables.completion import OBSERVATION_SIZE
 
 ADAM = FitConfig(iterations=200, starts=1)
-# converges further than the defaults, on Adam's own loss
-SOLVER = CodeFitConfig(24, starts=1, stages=8, narrowing=0.65, robust=0, sharpening=0, compared=Comparison())
+BUDGETS = (2, 4, 8, 16, 24)  # iterations of Levenberg–Marquardt, each in a fit of its own
 POINTS = (100,)  # observed depths; 0: all of them
 RAYS = 1000  # with a depth, and as many of the silhouette, that measure the loss of every curve
 RESOLUTION = 128  # of the meshes that are compared
@@ -83,7 +80,7 @@ def compared(
     loss = common_loss(model, view, prior)
     decoder = model.decoder
     adam = measured(fit_shape(decoder, [view], prior, ADAM), EVERY, loss)
-    curves = {"adam": adam, "lm": measured(fit_code(decoder, [view], prior, SOLVER), 1, loss)}
+    curves = {"adam": adam, "lm": measured_budgets(decoder, view, prior, loss)}
     for name, curve in curves.items():
         reached = curve.reached(adam.losses[-1])
         yield (
@@ -113,6 +110,14 @@ def common_loss(model: Model, view: View, prior: Prior) -> Loss:
         return float(torch.stack(list(terms.values())).sum() + ADAM.weights.code * w.square().mean())
 
     return loss
+
+
+def measured_budgets(decoder: Decoder, view: View, prior: Prior, loss: Loss) -> Curve:
+    """Returns the losses of `fit_code` from the mean shape, after each number of iterations."""
+    configs = [CodeFitConfig(starts=1, iterations=count) for count in BUDGETS]
+    fits = [fit_code(decoder, [view], prior, config) for config in configs]
+    losses = [loss(fit.code) for fit in fits]
+    return Curve([fit.seconds for fit in fits], losses, fits[-1].evaluations, fits[-1].code)
 
 
 def measured(steps: Iterable[Step], every: int, loss: Loss) -> Curve:

@@ -15,22 +15,19 @@ from distrace.data.observation import observe
 from distrace.data.samples import sample
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, solid_of
-from distrace.fitting.code_residuals import Comparison
-from distrace.fitting.continuation import CodeFitConfig
-from distrace.fitting.fit_code import fit_points
+from distrace.fitting.fit_code import CodeFitConfig, fit_points
 from distrace.fitting.free_space import completed
-from distrace.fitting.methods import METHODS, steps_of, told
-from distrace.losses import Weights
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 from experiments.datasets.pictured import pictured
+from experiments.tables.methods import METHODS, completed_by, told
 
 OBSERVATION_SIZE = 256
 SAMPLES = 40_000  # distances that a held-out shape is fitted to
 SAMPLES_NEAR = 0.5  # share of them near the surface; the rest covers free space
-SAMPLES_FIT = CodeFitConfig(iterations=40, robust=0, compared=Comparison(Weights(code=1e-4)))
+SAMPLES_FIT = CodeFitConfig(iterations=40, points=2000, deviation=0.001)  # the prior hardly counts
 
 
 @dataclass(frozen=True)
@@ -77,10 +74,9 @@ def held_out_results(model: Model, shapes: list[Shape], meshes: Path, resolution
 def fit_to_distances(model: Model, name: str, solid: Solid, resolution: int) -> Result:
     """Returns the best representation of a solid by the model."""
     samples = torch.from_numpy(sample(solid, SAMPLES, seed=0, near=SAMPLES_NEAR))
-    steps = list(fit_points(model.decoder, samples, prior_of(model.codes), SAMPLES_FIT))
-    seconds = sum(step.seconds for step in steps)
-    mesh = extract_mesh(model.field(steps[-1].code), MeshConfig(resolution))
-    return compared(name, "all distances", 0, mesh, solid.surface, seconds)
+    fit = fit_points(model.decoder, samples, prior_of(model.codes), SAMPLES_FIT)
+    mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
+    return compared(name, "all distances", 0, mesh, solid.surface, fit.seconds)
 
 
 def completion_results(
@@ -92,9 +88,9 @@ def completion_results(
         view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
         for method in METHODS:
             observation = told(view, method)
-            steps = list(steps_of(model, observation, method, config))
-            mesh = completed(model.field(steps[-1].code), observation, MeshConfig(resolution))
-            yield compared(shape.name, method, points, mesh, solid.surface, sum(step.seconds for step in steps))
+            fit = completed_by(method, model, observation, config)
+            mesh = completed(model.field(fit.code), observation, MeshConfig(resolution))
+            yield compared(shape.name, method, points, mesh, solid.surface, fit.seconds)
 
 
 def compared(

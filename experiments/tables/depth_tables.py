@@ -8,11 +8,11 @@ import torch
 
 from distrace.camera import Camera
 from distrace.data.solid import Solid
-from distrace.fitting.methods import told
 from distrace.report.page import Html, figure, page, paragraph, section, table
 from distrace.shading import Picture, grid
 from experiments.charts import steps_chart
 from experiments.datasets.pictured import pictured
+from experiments.tables.methods import told
 from experiments.tables.sparse_depth import DENSITIES, SIZE, Done, camera_of, observed, surface_of, true_solid
 from experiments.tables.trials import Place, grouped
 

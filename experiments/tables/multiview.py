@@ -25,8 +25,7 @@ from distrace.data.photographs import Photograph, load_photographs
 from distrace.data.pictures import read_mask
 from distrace.errors import explained
 from distrace.files import save_json, written
-from distrace.fitting.continuation import CodeFitConfig
-from distrace.fitting.fit_code import fit_code
+from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer, surface_points
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
@@ -171,8 +170,8 @@ def _fitted(trial: ClipTrial, model: Model, clip: dict[str, Any]) -> tuple[Float
     config = _config(trial.method)
     views = list(load_photographs(trial.folder).views)
     if trial.method == "silhouettes":
-        *_, step = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
-        return step.code, identity
+        fit = fit_code(model.decoder, [_silhouette(trial.folder, view) for view in views], prior)
+        return fit.code, identity
     if trial.method == "nearest":
         coarse = PhotoSet(model.decoder, [view.resized(0.5) for view in views], prior, config.comparison)
         best = Initialiser(coarse).ranked(identity)[0]

@@ -18,7 +18,7 @@ from torch import Tensor
 from distrace.data.scan import Up, scan_of_view
 from distrace.data.solid import Solid, normalised, solid_of
 from distrace.files import save_json
-from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.mesh import extract_mesh
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
@@ -108,8 +108,7 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     scene = sensed(solid, hash_of(trial.shape) + trial.scene, trial.hidden)
     scan = scan_of_view(scene.view, scene.mask, Up.told("y"))
     known = scene.place if trial.told else None
-    *_, fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known)
-    assert isinstance(fit, ScanFit)
+    fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known)
     degrees, size, centre = placement_error(fit.place, scene.place, symmetric_turns(place.meshes, trial))
     mesh = extract_mesh(place.field_of(trial.category, fit.code), place.mesh)
     result = Placed(

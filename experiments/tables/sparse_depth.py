@@ -20,12 +20,12 @@ from distrace.data.observation import View, observe
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, solid_of
 from distrace.files import save_json
-from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.free_space import completed
-from distrace.fitting.methods import settings_of, steps_of, told
 from distrace.metrics import chamfer
 from experiments.datasets.noise import NOISES, noisy
 from experiments.datasets.splits import on_side, shape_of
+from experiments.tables.methods import completed_by, settings_of, told
 from experiments.tables.trials import Place, fingerprint, hash_of, read_json
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
@@ -148,18 +148,17 @@ def done(place: Place, trial: Trial) -> Done:
         if content.pop("made_by", None) == mark:
             return Done(Trial(**content.pop("trial")), **content)
     observation = told(observed(trial, place.meshes), trial.method)
-    steps = list(steps_of(model, observation, trial.method, config))
-    code = steps[-1].code
-    surface = surface_of(place, trial, observation, code)
+    fit = completed_by(trial.method, model, observation, config)
+    surface = surface_of(place, trial, observation, fit.code)
     truth = true_solid(place.meshes, trial.category, trial.shape).surface
     distance = chamfer(EMPTY if surface is None else surface, truth)
     result = Done(
         trial,
         distance.to,
         distance.from_,
-        sum(step.seconds for step in steps),
-        sum(step.evaluations for step in steps),
-        [round(x, 6) for x in code.tolist()],
+        fit.seconds,
+        fit.evaluations,
+        [round(x, 6) for x in fit.code.tolist()],
     )
     save_json(path, {"made_by": mark, **asdict(result)})
     return result

@@ -1,5 +1,6 @@
 """Correlates the spread of several completions with the error of one."""
 
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,10 +12,9 @@ from scipy.stats import rankdata
 
 from distrace.data.observation import observe
 from distrace.data.shapes import Shape
-from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.completing import complete_shape, plausible, spread
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.free_space import completed
-from distrace.fitting.methods import completing
-from distrace.fitting.posterior import plausible, spread
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
 from distrace.processes import each_done
@@ -49,11 +49,13 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
     truth = true_solid(meshes, category, name)
     seed = hash_of(name)
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
-    steps = list(completing(network, view, CodeFitConfig()))
-    samples = list(plausible(network, view, COMPLETIONS, seed=seed))
-    mesh = completed(network.field(steps[-1].code), view, MeshConfig())
+    began = time.perf_counter()
+    fit = complete_shape(network, view, CodeFitConfig())
+    others, _ = plausible(network, view, COMPLETIONS, CodeFitConfig(seed=seed))
+    seconds = time.perf_counter() - began
+    mesh = completed(network.field(fit.code), view, MeshConfig())
     points = surface_points(mesh, SURFACE_POINTS, seed=0)
-    deviation = spread(network, [step.code for step in samples], torch.tensor(points, dtype=torch.float32)).numpy()
+    deviation = spread(network, others, torch.tensor(points, dtype=torch.float32)).numpy()
     error = truth.apart(points)
     calm = deviation < np.median(deviation)
     return SpreadRow(
@@ -63,5 +65,5 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
         float(error[calm].mean()),
         float(error[~calm].mean()),
         chamfer(mesh, truth.surface).sum,
-        sum(step.seconds for step in (*steps, *samples)),
+        seconds,
     )

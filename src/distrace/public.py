@@ -12,10 +12,9 @@ from distrace.fields import primitives
 from distrace.fields.base import SDF, chunked, placed
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig, fit_shape
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
-from distrace.fitting.fit_code import fit_code
+from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import Chamfer, chamfer
 from distrace.pose import Similarity, exp_se3, pose_error

@@ -11,7 +11,7 @@ from spheres import Spheres
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.data.observation import View
-from distrace.fitting.multistart import Step
+from distrace.fitting.fit import Step
 from distrace.rays import meet_sphere
 from experiments.costs import solvers
 from experiments.costs.pages import solvers_page

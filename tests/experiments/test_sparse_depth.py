@@ -12,7 +12,7 @@ from pretended import DEVICE, pretended
 
 from distrace.checkpoints.model import Model, save_model
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.rays import meet_sphere
@@ -114,7 +114,7 @@ def test_a_trial_is_kept_until_the_model_changes(place: Place) -> None:
 def test_shapes_are_completed_and_looked_at_on_the_device(
     place: Place, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    short = CodeFitConfig(iterations=4, starts=1, more=0)
+    short = CodeFitConfig(iterations=4, starts=1)
     monkeypatch.setattr(focal_test, "RATIOS", (1.0,))
     monkeypatch.setattr(sparse_depth, "CodeFitConfig", lambda: short)
     wanted, here = trial(place, density="20"), replace(place, out=tmp_path / "here")

@@ -18,8 +18,8 @@ from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
 from distrace.data.scan import CLOUDS, ScanOptions, load_scan
 from distrace.errors import explained
-from distrace.fitting.continuation import CodeFitConfig
 from distrace.fitting.fit import FitConfig
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.judge import Verdict
 from distrace.mesh import MeshConfig
 
@@ -64,7 +64,7 @@ class Complete:
     ignore: tuple[Literal["mask", "normal"], ...] = ()  # canonical: parts to ignore; only adam uses a view's normals
     solver: Literal["lm", "adam"] = "lm"  # canonical: Levenberg–Marquardt, or Adam as in DIST; clouds need lm
     iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None  # canonical
-    starts: int = FitConfig.starts  # canonical: of the multi-start fit
+    starts: Annotated[int | None, default("8 of lm, 3 of adam", "INT")] = None  # canonical: of the multi-start fit
     plausible: int = 0  # canonical: number of other completions that also fit
 
     def run(self) -> None:
@@ -94,7 +94,8 @@ class Complete:
         cloud = path.suffix.lower() in CLOUDS
         chosen = CodeFitConfig if self.solver == "lm" or cloud else FitConfig
         iterations = chosen.iterations if self.iterations is None else self.iterations
-        fit = chosen(iterations=iterations, starts=self.starts, seed=self.seed)
+        starts = chosen.starts if self.starts is None else self.starts
+        fit = chosen(iterations=iterations, starts=starts, seed=self.seed)
         full = load_cloud(path) if cloud else load_view(path)
         known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
         self._check(path, known, chosen)

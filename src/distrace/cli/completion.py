@@ -1,11 +1,12 @@
 """A completion in the canonical frame: the fit, the mesh, the distance to the truth, the verdict, and the page."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace import shading
 from distrace.benchmarks.measuring import poster_view
@@ -17,13 +18,11 @@ from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.data.scan import canonical_scan
 from distrace.files import save_text
-from distrace.fitting.continuation import CodeFitConfig
+from distrace.fitting.completing import complete_shape, plausible, spread
 from distrace.fitting.fit import FitConfig
+from distrace.fitting.fit_code import CodeFit, CodeFitConfig
 from distrace.fitting.free_space import LEFT_OUT, completed
 from distrace.fitting.judge import Verdict, judged
-from distrace.fitting.methods import completing
-from distrace.fitting.multistart import Step
-from distrace.fitting.posterior import plausible, spread
 from distrace.mesh import MeshConfig
 from distrace.metrics import Chamfer, chamfer, iou
 from distrace.pose import Similarity
@@ -56,8 +55,8 @@ class Task:
         """Returns the view's camera; clouds are shown from above and in front."""
         return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
 
-    def surface(self, step: Step) -> "trimesh.Trimesh":
-        return completed(self.model.field(step.code), self.known, self.mesh)
+    def surface(self, code: Float[Tensor, "length"]) -> "trimesh.Trimesh":
+        return completed(self.model.field(code), self.known, self.mesh)
 
     def shown(self, observation: View | Cloud) -> View:
         return observation.seen_from(self.camera) if isinstance(observation, Cloud) else observation
@@ -65,33 +64,29 @@ class Task:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The steps of a fit, and its results."""
+    """The result of a fit, and of the fits of other completions."""
 
-    steps: list[Step]
-    others: list[Step]
+    fit: CodeFit
+    others: list[Float[Tensor, "length"]]  # codes
     mesh: "trimesh.Trimesh"
     chamfer: Chamfer | None
-
-    @property
-    def evaluations(self) -> int:
-        return sum(step.evaluations for step in (*self.steps, *self.others))
+    evaluations: int  # of all fits
 
 
 def complete(run: Run, task: Task) -> Verdict:
     """Fits, and writes mesh, placement, code, pictures, page and `result.json`."""
-    steps = _fitted(task)
-    last = steps[-1]
-    save_code(run.out, last.code, Similarity.identity())
-    outcome = _outcome(task, steps)
+    with progress("fitting", task.fit.total) as bar:
+        fit = complete_shape(task.model, task.known, task.fit, lambda done: bar.advance(to=done))
+    save_code(run.out, fit.code, Similarity.identity())
+    outcome = _outcome(task, fit)
     save_completed(run.out, outcome.mesh)
-    for step in outcome.others:
-        save_mesh(run.out / f"plausible-{step.start + 1}.ply", task.surface(step))
+    for number, code in enumerate(outcome.others, 1):
+        save_mesh(run.out / f"plausible-{number}.ply", task.surface(code))
     content = _page_content(task, outcome)
     shading.save_png(run.out / "shaded.png", content.after.shaded)
     with run.optional("report.html"):
         save_text(run.out / "report.html", report.completion_page(content))
-    facts = {"loss": last.loss, "terms": last.terms, "start": last.start, "evaluations": outcome.evaluations}
-    facts |= content.verdict.facts()
+    facts = {"loss": fit.loss, "evaluations": outcome.evaluations} | content.verdict.facts()
     lines = [f"{content.verdict.name}: {content.verdict.reason}"]
     if outcome.chamfer:
         distances, line = chamfer_facts(outcome.chamfer)
@@ -101,48 +96,28 @@ def complete(run: Run, task: Task) -> Verdict:
     return content.verdict
 
 
-def _fitted(task: Task) -> list[Step]:
-    steps: list[Step] = []
-    with progress("fitting", task.fit.total) as bar:
-        for step in completing(task.model, task.known, task.fit):
-            steps.append(step)
-            bar.advance(f"{step.name}, loss {step.loss:.4f}")
-    return steps
-
-
-def _outcome(task: Task, steps: list[Step]) -> Outcome:
+def _outcome(task: Task, fit: CodeFit) -> Outcome:
     """Returns the surface and the other completions. Raises `ValueError` for a field without a zero."""
-    others = list(_others(task))
-    mesh = task.surface(steps[-1])
-    if others and len(mesh.faces):
-        codes = [step.code for step in others]
-        vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
-        mesh.vertex_attributes["spread"] = spread(task.model, codes, vertices).cpu().numpy()
-    return Outcome(steps, others, mesh, None if task.truth is None else chamfer(mesh, task.truth))
-
-
-def _others(task: Task) -> Iterator[Step]:
+    others: list[Tensor] = []
+    evaluations = fit.evaluations
     if task.plausible:
-        with progress("other completions", task.plausible) as bar:
-            for step in plausible(task.model, task.known, task.plausible, seed=task.fit.seed):
-                yield step
-                bar.advance(f"loss {step.loss:.4f}")
+        config = CodeFitConfig(seed=task.fit.seed)
+        others, spent = plausible(task.model, task.known, task.plausible, config)
+        evaluations += spent
+    mesh = task.surface(fit.code)
+    if others and len(mesh.faces):
+        vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
+        mesh.vertex_attributes["spread"] = spread(task.model, others, vertices).cpu().numpy()
+    return Outcome(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
 
 
 def _page_content(task: Task, outcome: Outcome) -> report.Completion:
     """Returns everything that the page shows."""
     known = task.shown(task.known)
     full = task.shown(task.full)
-    last = outcome.steps[-1]
-    distinct: dict[tuple[int, int], Step] = {}
-    for step in outcome.steps:
-        distinct.setdefault((step.start, step.iteration), step)  # the last step repeats the best one
-    losses: dict[str, list[float]] = {}
-    for step in distinct.values():
-        name = "outline" if "outline" in step.terms else step.name
-        losses.setdefault(name, []).append(step.loss)
+    code = outcome.fit.code
     with torch.no_grad():
-        codes = (prior_of(task.model.codes).mean, last.code)
+        codes = (prior_of(task.model.codes).mean, code)
         camera = task.camera.to(task.mesh.device)
         before, after = (report.View.of(render(task.model.field(code), camera)) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
@@ -150,12 +125,13 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
         "pieces removed from the mesh, where the view shows free space": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
-        "iterations": str(task.fit),
+        "iterations": str(task.fit.total),
+        "starts": str(task.fit.starts),
         "evaluations of the network": f"{outcome.evaluations:,}",
-        "time of the fit": f"{sum(step.seconds for step in outcome.steps):.0f} s on {task.mesh.device}",
+        "time of the fit": f"{outcome.fit.seconds:.0f} s on {task.mesh.device}",
         "seed": str(task.fit.seed),
     }
-    sdf = task.model.field(last.code)
+    sdf = task.model.field(code)
     overlap = None if known.mask is None else iou(torch.from_numpy(after.mask), known.mask)
     scan = canonical_scan(task.known).to(task.mesh.device)
     verdict = judged(scan, sdf, Similarity.identity().to(task.mesh.device), silhouette=overlap)
@@ -169,12 +145,12 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         after=after,
         truth=None if task.known is task.full else _truth_view(full),
         others=_other_pictures(task, outcome) if outcome.others else [],
-        losses=losses,
+        losses=outcome.fit.losses,
         mesh=outcome.mesh,
         truth_points=task.truth if isinstance(task.truth, np.ndarray | None) else task.truth.vertices,
         chamfer=outcome.chamfer,
         facts=facts,
-        chosen=outcome.steps[-1].name,
+        chosen=next(iter(outcome.fit.losses)),
     )
 
 
@@ -184,10 +160,10 @@ def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]
     camera = task.camera.to(task.mesh.device)
     camera = camera.resized(SMALL / camera.height)
     model = task.model
-    codes = [step.code for step in outcome.others]
+    codes = outcome.others
     rows = []
     for eye in (camera, camera.turned(180.0)):
-        buffers = render(model.field(outcome.steps[-1].code), eye)
+        buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
         distance[buffers.mask] = spread(model, codes, buffers.points)
         pictures = [report.View.of(render(model.field(code), eye)).shaded for code in codes]

@@ -84,15 +84,8 @@ def _fitted(task: ScanTask) -> ScanFit:
     prior = prior_of(task.model.codes)
     scan = task.scan.to(task.mesh.device)
     console.print(f"fitting {len(scan.points):,} points and {len(scan.free_until):,} rays of free space")
-    fit: ScanFit | None = None
     with progress("fitting", config.total) as bar:
-        for step in fit_scan(task.model.decoder, scan, prior, config):
-            if isinstance(step, ScanFit):
-                fit = step
-            else:
-                bar.advance(to=step)
-    assert fit is not None
-    return fit
+        return fit_scan(task.model.decoder, scan, prior, config, progress=lambda done: bar.advance(to=done))
 
 
 @torch.no_grad()

@@ -1,4 +1,4 @@
-"""What all residuals of a code share: exact derivatives of the field by the code, and the prior of its coordinates."""
+"""Exact derivatives of a field by its code, which all residuals of a code are made from."""
 
 import torch
 from jaxtyping import Float
@@ -6,26 +6,9 @@ from torch import Tensor
 
 from distrace.fields.decoder import RECORDED_CHUNK, Decoder
 from distrace.fields.precision import BFloat16Decoder, PackedDecoder
-from distrace.fitting.solver import Residuals
 
 SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
 PART = RECORDED_CHUNK // 2  # rows of a Jacobian that are made at once
-
-
-def with_prior(
-    values: Float[Tensor, "n"],
-    jacobian: Float[Tensor, "n dimensions"],
-    weights: Float[Tensor, "n"],
-    w: Float[Tensor, "dimensions"],
-    weight: float,
-) -> Residuals:
-    """With residuals for the prior, whose loss is weight × the mean squared coordinate."""
-    count = len(w)
-    return Residuals(
-        torch.cat([values, SMALL * w]),
-        torch.cat([jacobian, SMALL * torch.eye(count).to(jacobian)]),
-        torch.cat([weights, values.new_full((count,), 2 * weight / count / SMALL**2)]),
-    )
 
 
 def derivatives(

@@ -1,175 +1,211 @@
-"""Fitting a shape's code by Levenberg–Marquardt, to views or to points: a tenth of Adam's steps, hardly dearer ones."""
+"""Fits a shape's code where its placement is known, by multi-start Levenberg–Marquardt: to views, or to points."""
 
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import partial
-from itertools import chain
-from math import isfinite
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.observation import View
-from distrace.fields.batch import CountedBatch
-from distrace.fields.decoder import FAR, Decoder
-from distrace.fields.precision import BFloat16Decoder, fastest
-from distrace.fitting.code_residuals import Problem
-from distrace.fitting.continuation import CodeFitConfig, ProblemOf, fitted, stage_of
-from distrace.fitting.fit import pools_of
-from distrace.fitting.multistart import Step, best_of, by_last_loss, charged, decided
-from distrace.fitting.noise_estimation import noise_of
-from distrace.fitting.observations import Seen
-from distrace.fitting.point_residuals import LOOKED, PointProblem, misfits
-from distrace.fitting.ray_sampling import drawn
-from distrace.fitting.retrieval import DEPTHS, SILHOUETTE, Hints, first_of
-from distrace.fitting.solver import SolverConfig
-from distrace.fitting.verdict import contradictions
-from distrace.prior import Prior
+from distrace.data.scan import canonical_scan
+from distrace.fields.decoder import Decoder
+from distrace.fields.precision import fastest
+from distrace.fitting.ray_sampling import Targets, drawn, pools_of
+from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
+from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample
+from distrace.fitting.solver import SolverConfig, cauchy
+from distrace.fitting.starts import Hints, nearest_codes
+from distrace.pose import Similarity
+from distrace.prior import START_DEVIATION, Prior
+from distrace.rays import Rays
 
-Verdicts = Callable[[CountedBatch, Sequence[Step]], list[float]]
-"""Of the shapes of several steps, which have a field together."""
-Judge = Callable[[Sequence[Step]], list[Step]]
-"""From steps to those with a verdict, and with the time and the evaluations that this took."""
+HINTS = (100, 300)  # points and rays that tell which training shapes are near
+TELLING = 1000  # depths of a view: fewer lie so far apart that the shape's bends look like noise
+SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
+SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
+
+
+@dataclass(frozen=True)
+class CodeFitConfig:
+    """Two rounds: all starts roughly, and the best ones to the end. All draws follow from the seed."""
+
+    starts: int = 8  # the mean shape, and the training shapes that are nearest
+    finalists: int = 3
+    iterations: int = 16  # of the best start, of which three eighths are in the first round
+    points: int = 500  # of each view, in the second round; a fifth in the first one
+    rays: int = 400  # the same; a third in the first round
+    deviation: float = 0.006  # of a shape that the model represents from the observation, in radii of the unit sphere
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if min(self.iterations, self.starts, self.finalists) < 1:
+            given = f"{self.iterations} iterations and {self.starts} starts, {self.finalists} of them to the end,"
+            raise ValueError(f"{given} were asked for; each must be at least 1")
+
+    @property
+    def rounds(self) -> tuple[Round, ...]:
+        """The rounds, the last of which is never empty."""
+        first = self.iterations * 3 // 8
+        every = 1 << 20  # dimensions: all that the prior has
+        rough = Round(self.starts, first, every, self.points // 5, self.rays // 3, SAMPLES, 3 * self.deviation)
+        fine = Round(self.finalists, self.iterations - first, every, self.points, self.rays, SAMPLES, self.deviation)
+        return (rough, fine) if first else (fine,)
+
+    @property
+    def total(self) -> int:
+        """Iterations of all rounds."""
+        return self.iterations
+
+
+@dataclass(frozen=True)
+class CodeFit:
+    """The code that explains an observation best."""
+
+    code: Float[Tensor, "length"]
+    loss: float
+    losses: dict[str, list[float]]  # over the iterations of each start that reached the last round, the best one first
+    evaluations: int  # of the field
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a shape is fitted to: points and rays, drawn from views or from a list of points."""
+
+    draw: Callable[[int, int, torch.Generator], ScanSample]  # at most so many points and rays of each view
+    noise: float  # standard deviation of the points about the surface
+
+    @staticmethod
+    def of_views(decoder: Decoder, views: Sequence[View], prior: Prior) -> "Observed":
+        """Raises `ValueError` without views, or with one from inside the mean shape."""
+        pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
+        dense = [view.to("cpu") for view in views if int(view.seen.sum()) >= TELLING]
+        noise = max((canonical_scan(view).noise for view in dense), default=0.0)
+
+        def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
+            return _sample([pool.draw(points, rays, random) for pool in pools], 2 * noise)
+
+        return Observed(draw, noise)
+
+    @staticmethod
+    def of_points(samples: Float[Tensor, "n 4"]) -> "Observed":
+        """Takes points and their signed distances from the surface. Raises `ValueError` without points."""
+        if not len(samples):
+            raise ValueError("no points were given; fitting needs points with their signed distances")
+
+        def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
+            chosen = drawn(samples, points + rays, random)
+            none = samples[:0, :3]
+            return ScanSample(chosen[:, :3], Rays(none, none), none[:, 0], 0, chosen[:, 3])
+
+        return Observed(draw, 0.0)
 
 
 def fit_code(
-    decoder: Decoder, views: Sequence[View], prior: Prior, config: CodeFitConfig = CodeFitConfig()
-) -> Iterator[Step]:
-    """Fits a code to views, from several starts; the ends that contradict the views least are taken to their outlines.
+    decoder: Decoder,
+    views: Sequence[View],
+    prior: Prior,
+    config: CodeFitConfig = CodeFitConfig(),
+    progress: Progress | None = None,
+) -> CodeFit:
+    """Fits a code to views of the shape in the unit sphere, from the mean shape and the nearest training shapes.
 
-    The last step is the result. Raises `ValueError` without views, or with one from inside the mean shape.
+    Raises `ValueError` without views, or with one from inside the mean shape.
+
+    >>> model = dt.load_model("sofas")  # doctest: +SKIP
+    >>> fit = dt.fit_code(model.decoder, [dt.load_view(path)], dt.prior_of(model.codes))  # doctest: +SKIP
     """
-    pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-    noises, quick = [noise_of(view) for view in views], fastest(decoder)
-
-    def seen(random: torch.Generator, depths: int, silhouette: int, touching: int = 0) -> Seen:
-        targets = [pool.draw(depths, silhouette, random, touching) for pool in pools]
-        return Seen.of(targets, config.compared.weights, noises)
-
-    def problem(random: torch.Generator, share: float) -> Problem:
-        some = seen(random, config.depth_rays, round(config.mask_rays * share))
-        return Problem(quick, prior, some, config.compared)
-
-    others = seen(torch.Generator().manual_seed(config.seed + 1), config.depth_rays, config.mask_rays)
-
-    def verdicts(field: CountedBatch, steps: Sequence[Step]) -> list[float]:
-        return contradictions(field, others, config.compared.trace)
-
-    random = torch.Generator().manual_seed(config.seed)
-    hints = Hints.of(seen(random, DEPTHS, SILHOUETTE), random)
-    few = hints.depths < DEPTHS  # they hardly tell which training shapes are near
-    config = config if few else replace(config, hops=0, sharpened=1)
-    judge = partial(_judged, quick, verdicts)
-    steps = _best(quick, prior, hints, problem, config, judge)
-    if not config.sharpening or not any(len(pool.between) for pool in pools):
-        return steps
-    random = torch.Generator().manual_seed(config.seed + 2)
-    sharp = seen(random, config.depth_rays, config.mask_rays // 2, config.outline_rays)
-    return _then_sharpened(steps, Problem(quick, prior, sharp, config.compared, config.outlying), config, judge)
-
-
-def _then_sharpened(steps: Iterator[Step], problem: Problem, config: CodeFitConfig, judge: Judge) -> Iterator[Step]:
-    """Steps, and from the best of their ends others that bring the surface to the outline; the best end comes last.
-
-    From farther away such rays, which pull from both sides, lead to other ends more often than they help.
-    """
-    ends: dict[int, Step] = {}
-    for step in steps:
-        yield step
-        if isfinite(step.verdict):
-            ends[step.start] = step
-    best = sorted(ends.values(), key=lambda end: end.verdict)[: config.sharpened]
-    solver = SolverConfig(config.sharpening, even=True, scale=problem.scale, settled=0.0)
-    w, done = [problem.prior.coordinates(end.code) for end in best], [(end.start, end.iteration) for end in best]
-    sharper, _ = stage_of(problem, w, None, solver, [config.damping] * len(best), done)
-    yield from chain.from_iterable(sharper)
-    yield decided(judge([*best, *(fit[-1] for fit in sharper)]))
+    return fit_observed(decoder, Observed.of_views(decoder, views, prior), prior, config, progress)
 
 
 def fit_points(
-    decoder: Decoder, samples: Float[Tensor, "n 4"], prior: Prior, config: CodeFitConfig = CodeFitConfig()
-) -> Iterator[Step]:
-    """Fits a code to points and their signed distances, which are 0 on the surface, as `fit_code` does to views.
-
-    The end that is nearest to all of them is the last step again. A list of distances should tell where nothing is,
-    too: points far from the surface are compared only where a fit has come too near to them.
-
-    Raises `ValueError` without points.
-    """
-    if not len(samples):
-        raise ValueError("no points were given; fitting needs points with their signed distances")
-
-    def problem(random: torch.Generator, share: float) -> PointProblem:
-        count = config.depth_rays + round(config.mask_rays * share)
-        return PointProblem(decoder, prior, samples, count, random, weights)
-
-    def verdicts(field: CountedBatch, steps: Sequence[Step]) -> list[float]:
-        found = misfits(field, others)
-        return [weights.depth * misfit + step.terms["code"] for misfit, step in zip(found, steps, strict=True)]
-
-    random, weights = torch.Generator().manual_seed(config.seed), config.compared.weights
-    near = samples[samples[:, 3].abs() < FAR]
-    some = drawn(near if len(near) else samples, DEPTHS + SILHOUETTE, random)  # others say less of which shape it is
-    others = drawn(samples, LOOKED, torch.Generator().manual_seed(config.seed + 1))
-    hints, quick = Hints(some[:, :3], some[:, 3]), fastest(decoder)
-    return _best(quick, prior, hints, problem, replace(config, more=0, hops=0), partial(_judged, quick, verdicts))
-
-
-def _best(
-    decoder: Decoder | BFloat16Decoder,
+    decoder: Decoder,
+    samples: Float[Tensor, "n 4"],
     prior: Prior,
-    hints: Hints,
-    problem_of: ProblemOf,
-    config: CodeFitConfig,
-    judge: Judge,
-) -> Iterator[Step]:
-    """From all starts; the first step is charged with the search for them. The least verdict's end is the best.
+    config: CodeFitConfig = CodeFitConfig(),
+    progress: Progress | None = None,
+) -> CodeFit:
+    """Fits a code to points and their signed distances from the surface, which are 0 on it, as `fit_code` to views.
 
-    The first starts are fitted together, and so are those that follow while none fits. Then each hops from the best
-    one and looks at other rays (basin hopping: Wales and Doye, *J. Phys. Chem. A* 1997).
+    A distance beyond 0.1 only tells on which side a point lies. Raises `ValueError` without points.
     """
-    first = first_of(decoder, prior, hints, config.apart, config.seed)
-    fits: dict[int, list[Step]] = {}
-    wanted: set[int] = set()
-
-    def fit(starts: range, w: Sequence[Float[Tensor, "dimensions"]], seed: int) -> None:
-        steps = fitted(problem_of, prior, replace(config, seed=seed), w, starts[0])
-        judged = judge([each[-1] for each in steps])
-        for start, each, end in zip(starts, steps, judged, strict=True):
-            fits[start] = [*each[:-1], charged(end, [each[-1]])]
-
-    def run(start: int) -> Iterator[Step]:
-        if start not in fits:
-            group = range(config.starts) if start < config.starts else range(config.starts, config.apart)
-            fit(group, first.coordinates[group[0] : group[-1] + 1], config.seed)
-        wanted.add(start)
-        return iter(fits[start])
-
-    def hop(start: int, best: Step) -> Iterator[Step]:
-        seed = config.seed + start
-        away = prior.draw(torch.Generator().manual_seed(seed), config.hop)
-        fit(range(start, start + 1), [prior.coordinates(best.code) + away], seed)
-        return run(start)
-
-    steps = best_of(config, run, by_last_loss, lambda step: judge([step])[0], hop)
-    step = next(steps)
-    step = replace(step, seconds=step.seconds + first.seconds, evaluations=step.evaluations + first.evaluations)
-    for following in steps:
-        yield step
-        step = following
-    yield charged(step, [each for start, in_vain in fits.items() if start not in wanted for each in in_vain])
+    return fit_observed(decoder, Observed.of_points(samples), prior, config, progress)
 
 
-def _judged(decoder: Decoder | BFloat16Decoder, verdicts: Verdicts, steps: Sequence[Step]) -> list[Step]:
-    """Steps with the verdicts on their shapes, and what those took: nothing, for a step that has one."""
-    began, new = time.perf_counter(), [step for step in steps if not isfinite(step.verdict)]
-    if not new:
-        return [replace(step, seconds=0.0, evaluations=0) for step in steps]
-    field = CountedBatch(decoder.fields(torch.stack([step.code for step in new])))
-    found = verdicts(field, new)
-    seconds = (time.perf_counter() - began) / len(new)
-    each = zip(new, found, field.evaluations, strict=True)
-    judged = {id(step): replace(step, verdict=v, seconds=seconds, evaluations=spent) for step, v, spent in each}
-    return [judged.get(id(step)) or replace(step, seconds=0.0, evaluations=0) for step in steps]
+def fit_observed(
+    decoder: Decoder, observed: Observed, prior: Prior, config: CodeFitConfig, progress: Progress | None = None
+) -> CodeFit:
+    """Fits a code from the mean shape and the training shapes that contradict the observation least."""
+    began = time.perf_counter()
+    random = torch.Generator().manual_seed(config.seed)
+    quick = fastest(decoder)
+    hints = Hints.of(observed.draw(*HINTS, random), random)
+    nearest, evaluations = nearest_codes(quick, prior.codes, hints, config.starts - 1)
+    w = [torch.zeros_like(prior.mean), *(prior.coordinates(code) for code in nearest)]
+    states = [PlacedCode(k, prior.mean, each, _identity(prior)) for k, each in enumerate(w)]
+    ends = minimised(decoder, observed, prior, states, config, progress)
+    seconds = time.perf_counter() - began
+    return CodeFit(ends.states[0].code(prior), ends.losses[0], ends.curves, evaluations + ends.evaluations, seconds)
+
+
+def plausible_codes(
+    decoder: Decoder, observed: Observed, prior: Prior, count: int, config: CodeFitConfig
+) -> tuple[list[Float[Tensor, "length"]], int]:
+    """Returns codes that all fit, best first, and the number of evaluations.
+
+    Each is drawn to another draw of the prior than its mean, and follows it where nothing was observed (randomise, then
+    optimise: Bardsley et al., SIAM J. Sci. Comput. 2014).
+    """
+    random = torch.Generator().manual_seed(config.seed)
+    bases = [prior.code(prior.draw(random, START_DEVIATION)) for _ in range(2 * count)]  # half may end far off
+    states = [PlacedCode(k, base, torch.zeros_like(base), _identity(prior)) for k, base in enumerate(bases)]
+    ends = minimised(decoder, observed, prior, states, replace(config, starts=len(states), finalists=count), None)
+    return [state.code(prior) for state in ends.states], ends.evaluations
+
+
+def minimised(
+    decoder: Decoder,
+    observed: Observed,
+    prior: Prior,
+    states: Sequence[PlacedCode],
+    config: CodeFitConfig,
+    progress: Progress | None,
+) -> Ends:
+    """Runs the rounds from given states."""
+    quick = fastest(decoder)
+    random = torch.Generator().manual_seed(config.seed + 1)
+
+    def problem_of(stage: Round) -> ScanProblem:
+        sample = observed.draw(stage.points, stage.rays, random)
+        deviation = (stage.deviation**2 + observed.noise**2) ** 0.5
+        return ScanProblem(quick, prior, sample, deviation, (), 0.0, stage.samples, moves=False, code_deviation=1.0)
+
+    return run_rounds(states, config.rounds, problem_of, SOLVER, progress)
+
+
+def _identity(prior: Prior) -> Similarity:
+    return Similarity.identity().to(prior.mean.device)
+
+
+def _sample(targets: Sequence[Targets], before: float) -> ScanSample:
+    """Returns points at depths, rays that are free until `before` these or beside the object, and rays that meet it."""
+    points = []
+    free: list[Rays] = []
+    until = []
+    hits: list[Rays] = []
+    for target in targets:
+        rays = target.camera.rays(target.pixels)
+        distance = target.depth / target.camera.cosines(target.pixels)
+        known = distance.isfinite()
+        points.append(rays.at(distance)[known])
+        is_free = known | ~target.is_object
+        free.append(rays[is_free])
+        until.append(distance[is_free] - before)
+        hits.append(rays[target.is_object & ~known])
+    every = [*free, *hits]
+    rays = Rays(torch.cat([each.origins for each in every]), torch.cat([each.directions for each in every]))
+    ends = torch.cat(until)
+    beyond = ends.new_full((len(rays.origins) - len(ends),), torch.inf)
+    return ScanSample(torch.cat(points), rays, torch.cat([ends, beyond]), len(ends))

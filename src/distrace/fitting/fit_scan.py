@@ -4,39 +4,25 @@ Points and rays are compared as they are, without tracing; robustly, so that poi
 """
 
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
-from math import inf
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from torch.nn.functional import pad
 
 from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
 from distrace.fitting.judge import Verdict, disagreement_of, judged, surface_points
 from distrace.fitting.proposals import proposed, proposed_codes
+from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample, Start
-from distrace.fitting.solver import Descent, SolverConfig, descend, geman_mcclure
+from distrace.fitting.solver import SolverConfig, geman_mcclure
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
 JUDGED_POINTS = 500
+SOLVER = SolverConfig(damping=1e-2, kernel=geman_mcclure, settled=1e-3)
 EQUAL = 0.15  # of the least loss: an end that is no worse by more may be right as well
-
-
-@dataclass(frozen=True)
-class Round:
-    """Some iterations of several starts."""
-
-    starts: int  # the best ones of the round before
-    iterations: int
-    dimensions: int  # leading coordinates of the code
-    points: int
-    rays: int
-    samples: int  # on each ray
-    deviation: float  # of the shape from the scan, in radii of the scan
 
 
 @dataclass(frozen=True)
@@ -76,8 +62,9 @@ def fit_scan(
     prior: Prior,
     config: ScanFitConfig = ScanFitConfig(),
     place: Similarity | None = None,
-) -> Iterator[int | ScanFit]:
-    """Yields the number of iterations that are done, and at last the fit. A `place` that is given is kept."""
+    progress: Progress | None = None,
+) -> ScanFit:
+    """Fits code and placement. A `place` that is given is kept."""
     began = time.perf_counter()
     quick = fastest(decoder)
     random = torch.Generator().manual_seed(config.seed)
@@ -87,50 +74,27 @@ def fit_scan(
     else:
         states = proposed_codes(scan, place, quick, prior, count, config.seed)
     starts = [_likely(state, scan) for state in states]
-    losses: list[list[float]] = [[] for _ in states]
-    evaluations = 0
-    done = 0
-    ends: list[tuple[float, PlacedCode]] = [(0.0, state) for state in states]
-    for stage in config.rounds:
+
+    def problem_of(stage: Round) -> ScanProblem:
         sample = ScanSample.drawn(scan, stage.points, stage.rays, random)
         deviation = (stage.deviation**2 * scan.radius**2 + scan.noise**2) ** 0.5
-        problem = ScanProblem(quick, prior, sample, deviation, starts, scan.tilt, stage.samples, place is None)
-        dimensions = min(stage.dimensions, prior.basis.shape[1])
-        begins = [_widened(state, dimensions) for _, state in ends[: stage.starts]]
-        descents = [Descent(*each, 1e-2) for each in zip(begins, problem.residuals(begins), strict=True)]
-        solver = SolverConfig(stage.iterations, kernel=geman_mcclure, settled=1e-3)
-        for iteration in range(stage.iterations):
-            going = [descent for descent in descents if not descent.settled]
-            if going:
-                descend(going, problem.residuals, problem.retract, solver, iteration)
-            for descent in descents:
-                losses[descent.state.start].append(descent.residuals.loss(1.0, geman_mcclure))
-            done += 1
-            yield done
-        evaluations += sum(problem.evaluations.values())
-        ends = sorted(((_loss(descent), descent.state) for descent in descents), key=lambda end: end[0])
-    yield _fitted(decoder, scan, prior, ends, losses, evaluations, began)
+        return ScanProblem(quick, prior, sample, deviation, starts, scan.tilt, stage.samples, place is None)
+
+    ends = run_rounds(states, config.rounds, problem_of, SOLVER, progress)
+    return _fitted(decoder, scan, prior, ends, began)
 
 
-def _fitted(
-    decoder: Decoder,
-    scan: Scan,
-    prior: Prior,
-    ends: Sequence[tuple[float, PlacedCode]],
-    losses: Sequence[Sequence[float]],
-    evaluations: int,
-    began: float,
-) -> ScanFit:
-    least, best = ends[0]
-    codes = [state.code(prior) for _, state in ends]
+def _fitted(decoder: Decoder, scan: Scan, prior: Prior, ends: Ends, began: float) -> ScanFit:
+    least, best = ends.losses[0], ends.states[0]
+    codes = [state.code(prior) for state in ends.states]
     sdf = decoder.field(codes[0])
-    equal = [k for k, (loss, _) in enumerate(ends) if k and loss <= (1 + EQUAL) * least]
-    others = tuple((codes[k], ends[k][1].place) for k in equal)
+    equal = [k for k, loss in enumerate(ends.losses) if k and loss <= (1 + EQUAL) * least]
+    others = tuple((codes[k], ends.states[k].place) for k in equal)
     surface = best.place.to_world(surface_points(sdf, JUDGED_POINTS, scan.points))
     disagreement = disagreement_of(surface, best.place, [(decoder.field(code), place) for code, place in others])
     verdict = judged(scan, sdf, best.place, disagreement)
-    curves = {f"start {state.start + 1}": list(losses[state.start]) for _, state in ends}
-    return ScanFit(codes[0], best.place, least, verdict, curves, evaluations, time.perf_counter() - began, others)
+    seconds = time.perf_counter() - began
+    return ScanFit(codes[0], best.place, least, verdict, ends.curves, ends.evaluations, seconds, others)
 
 
 def _likely(state: PlacedCode, scan: Scan) -> Start:
@@ -138,12 +102,3 @@ def _likely(state: PlacedCode, scan: Scan) -> Start:
     axis = state.place.rotation[:, 1]
     up = scan.ups[(scan.ups @ axis).argmax()] if len(scan.ups) else None
     return Start(float(state.place.scale), up)
-
-
-def _widened(state: PlacedCode, dimensions: int) -> PlacedCode:
-    """Returns a state with more coordinates, which are zero, or fewer."""
-    return replace(state, w=pad(state.w, (0, dimensions - len(state.w))))
-
-
-def _loss(descent: Descent[PlacedCode]) -> float:
-    return descent.residuals.loss(1.0, geman_mcclure) if descent.residuals.values.isfinite().all() else inf

@@ -1,5 +1,6 @@
 """Which rays of an observed view a loss looks at, and what it expects there."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +10,7 @@ from torch.nn.functional import max_pool2d
 
 from distrace.camera import Camera
 from distrace.data.observation import View
+from distrace.fields.base import SDF
 from distrace.rays import meet_sphere
 
 OUTLINE = 9  # pixels across the band in which half of the silhouette's rays are drawn
@@ -23,15 +25,6 @@ class Targets:
     depth: Float[Tensor, "n"]
     is_object: Bool[Tensor, "n"]
     normal: Float[Tensor, "n 3"] | None
-    touches: Bool[Tensor, "n"]  # between a pixel of the object and one of the background: is_object, too
-
-    def touching(self, places: Float[Tensor, "m 2"]) -> "Targets":
-        """With rays along the outline."""
-        depth = torch.cat([self.depth, self.depth.new_full((len(places),), torch.inf)])
-        flags = (torch.cat([flag, flag.new_ones(len(places))]) for flag in (self.is_object, self.touches))
-        normal = None if self.normal is None else torch.cat([self.normal, self.normal.new_zeros(len(places), 3)])
-        is_object, touches = flags
-        return Targets(self.camera, torch.cat([self.pixels, places]), depth, is_object, normal, touches)
 
 
 @dataclass(frozen=True)
@@ -42,7 +35,6 @@ class Pool:
     with_depth: Tensor  # or with a normal, where that is all there is
     outline: Tensor
     anywhere: Tensor  # whose rays meet the unit sphere
-    between: Float[Tensor, "n 2"]  # places on the outline itself
 
     @staticmethod
     def of(view: View) -> "Pool":
@@ -50,24 +42,39 @@ class Pool:
         with_depth = view.seen.reshape(-1).nonzero()[:, 0]
         if view.mask is None:
             known = with_depth if len(with_depth) else view.observed.reshape(-1).nonzero()[:, 0]
-            return Pool(view, known, nothing, nothing, view.depth.new_empty(0, 2))
+            return Pool(view, known, nothing, nothing)
         meets = meet_sphere(view.camera.rays()).meets
         outline, anywhere = ((region & meets).reshape(-1).nonzero()[:, 0] for region in (band(view.mask), meets))
-        return Pool(view, with_depth, outline, anywhere, middles(view.mask, view.camera.pixels()))
+        return Pool(view, with_depth, outline, anywhere)
 
-    def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator, touching: int = 0) -> Targets:
-        """At most so many rays with a depth, and as many of the silhouette: half along its outline, half anywhere.
-
-        And so many that touch the object.
-        """
+    def draw(self, depth_rays: int, mask_rays: int, random: torch.Generator) -> Targets:
+        """Returns at most so many rays with a depth, and of the silhouette: half at its outline, half anywhere."""
         sets = ((self.with_depth, depth_rays), (self.outline, mask_rays // 2), (self.anywhere, mask_rays // 2))
         chosen = torch.cat([drawn(indices, count, random) for indices, count in sets])
         view = self.view
         is_object = view.observed.reshape(-1)[chosen]
         normal = None if view.normal is None else view.normal.reshape(-1, 3)[chosen]
-        pixels, depth = view.camera.pixels().reshape(-1, 2)[chosen], view.depth.reshape(-1)[chosen]
-        drawn_here = Targets(view.camera, pixels, depth, is_object, normal, torch.zeros_like(is_object))
-        return drawn_here if not touching else drawn_here.touching(drawn(self.between, touching, random))
+        pixels = view.camera.pixels().reshape(-1, 2)[chosen]
+        depth = view.depth.reshape(-1)[chosen]
+        return Targets(view.camera, pixels, depth, is_object, normal)
+
+
+@torch.no_grad()
+def pools_of(mean: SDF, views: Sequence[View], device: torch.device) -> list[Pool]:
+    """Returns the pool of each view.
+
+    Raises `ValueError` without views, or with one from inside the mean shape: nothing is hit from there.
+    """
+    if not views:
+        raise ValueError("no view was given; fitting needs at least one")
+    eyes = torch.stack([view.camera.T_world_camera[:3, 3] for view in views])
+    values = mean(eyes.to(device))
+    if (values < 0).any():
+        eye = [round(x, 3) for x in eyes[int(values.argmin())].tolist()]
+        raise ValueError(
+            f"the camera at {eye} is inside the mean shape; shapes are seen from outside, about the origin"
+        )
+    return [Pool.of(view) for view in views]
 
 
 def band(mask: Bool[Tensor, "height width"], width: int = OUTLINE) -> Bool[Tensor, "height width"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from distrace.data.scan import Scan
 from distrace.fields.batch import BatchField
-from distrace.fields.decoder import Decoder
+from distrace.fields.decoder import FAR, Decoder
 from distrace.fields.precision import BFloat16Decoder
 from distrace.fitting.code_jacobian import SMALL, derivatives
 from distrace.fitting.ray_sampling import drawn
@@ -56,6 +56,8 @@ class ScanSample:
     rays: Rays
     until: Float[Tensor, "m"]
     free: int
+    distances: Float[Tensor, "n"] | None = None
+    """Of the points from the surface, signed; one beyond `FAR` only tells the side. None: all points are on it."""
 
     @staticmethod
     def drawn(scan: Scan, points: int, rays: int, random: torch.Generator) -> "ScanSample":
@@ -85,6 +87,7 @@ class ScanProblem:
     tilt: float
     samples: int  # on each ray, at which its least value is sought
     moves: bool = True  # whether the placement is unknown
+    code_deviation: float = CODE_DEVIATION
     evaluations: Counter[int] = field(default_factory=Counter)  # of the field, by each start
 
     def retract(self, states: Sequence[PlacedCode], steps: Sequence[Tensor]) -> list[PlacedCode]:
@@ -162,19 +165,26 @@ class ScanProblem:
         values, gradient, by_code = extended(self.decoder, points, code)
         self.evaluations[state.start] += len(values)
         factor = place.scale / self.deviation
-        by_place = place.change(points, gradient) * factor
-        by_place[:, 3:6] *= place.scale
-        by_place[:, 6] += values * factor  # the residual is in the scan's unit
-        jacobian = torch.cat([by_code @ self.prior.basis[:, : len(state.w)] * factor, by_place], dim=1)
+        jacobian = by_code @ self.prior.basis[:, : len(state.w)] * factor
+        if self.moves:
+            by_place = place.change(points, gradient) * factor
+            by_place[:, 3:6] *= place.scale
+            by_place[:, 6] += values * factor  # the residual is in the scan's unit
+            jacobian = torch.cat([jacobian, by_place], dim=1)
         weights = values.new_full((len(values),), EFFECTIVE_POINTS / max(len(sample.points), 1))
         weights[len(sample.points) :] = EFFECTIVE_RAYS / max(len(sample.until), 1)
         off = values * factor
         off[len(sample.points) : len(sample.points) + free] -= MARGIN
+        if sample.distances is not None:
+            count = len(sample.points)
+            off[:count] -= sample.distances.clamp(-FAR, FAR) / self.deviation
+            far = (sample.distances.abs() > FAR) & (values[:count] * sample.distances.sign() > FAR)
+            off[:count][far] = 0.0
+            jacobian[:count][far] = 0.0
         beliefs, by_unknowns = self._beliefs(state)
-        jacobian = torch.cat([jacobian, SMALL * by_unknowns])
         return Residuals(
             torch.cat([off, SMALL * beliefs]),
-            jacobian if self.moves else jacobian[:, : len(state.w)],
+            torch.cat([jacobian, SMALL * by_unknowns]),
             torch.cat([weights, torch.full_like(beliefs, SMALL**-2)]),
         )
 
@@ -182,6 +192,8 @@ class ScanProblem:
         """Returns what the prior says, in standard deviations, and its derivatives by all unknowns."""
         count = len(state.w)
         w, place = state.w, state.place
+        if not self.moves:
+            return w / self.code_deviation, torch.eye(count).to(w) / self.code_deviation
         growth = (place.scale / self.starts[state.start].size).log()[None] / GROWTH
         tilt = w.new_zeros(0)
         by_turn = w.new_zeros(0, 3)
@@ -191,10 +203,10 @@ class ScanProblem:
             tilt = torch.linalg.cross(axis, up) / self.tilt
             by_turn = (axis[:, None] * up[None] - (axis @ up) * torch.eye(3).to(w)) / self.tilt
         derivatives = w.new_zeros(count + 1 + len(tilt), count + 7)
-        derivatives[:count, :count] = torch.eye(count) / CODE_DEVIATION
+        derivatives[:count, :count] = torch.eye(count) / self.code_deviation
         derivatives[count, count + 6] = 1 / GROWTH
         derivatives[count + 1 :, count : count + 3] = by_turn
-        return torch.cat([w / CODE_DEVIATION, growth, tilt]), derivatives
+        return torch.cat([w / self.code_deviation, growth, tilt]), derivatives
 
 
 def extended(

@@ -1,7 +1,6 @@
-"""Fitting a code to signed samples, without rendering: DeepSDF's own way (Park et al., CVPR 2019, section 4.3)."""
+"""DeepSDF's own fit of a code to signed samples, without rendering (Park et al., CVPR 2019, section 4.3)."""
 
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
@@ -9,7 +8,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.fields.decoder import Decoder
-from distrace.fitting.multistart import Step
+from distrace.fitting.fit_code import CodeFit
 from distrace.training.losses import clamped_loss
 
 
@@ -28,39 +27,26 @@ class SampleFitConfig:
 
 def fit_samples(
     decoder: Decoder, samples: Float[Tensor, "n 4"], config: SampleFitConfig = SampleFitConfig()
-) -> Iterator[Step]:
+) -> CodeFit:
     """Fits a code to points and their signed distances. Raises `ValueError` without samples."""
     if not len(samples):
         raise ValueError("no samples were given; fitting needs points with their signed distances")
+    began = time.perf_counter()
     random = torch.Generator().manual_seed(config.seed)
     code = config.code_deviation * torch.randn(decoder.specs.code_length, generator=random)
     code = code.to(samples.device).requires_grad_()
     optimiser = torch.optim.Adam([code])
+    losses = []
+    count = min(config.samples, len(samples))
     for iteration in range(config.iterations):
-        began = time.perf_counter()
         late = iteration >= config.iterations // 2
         optimiser.param_groups[0]["lr"] = config.learning_rate * (0.1 if late else 1.0)
-        batch = samples[torch.randint(len(samples), (min(config.samples, len(samples)),), generator=random)]
+        batch = samples[torch.randint(len(samples), (count,), generator=random)]
         distance = clamped_loss(decoder.field(code)(batch[:, :3]), batch[:, 3], config.clamp)
         loss = distance + config.code_weight * code.square().mean()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
-        terms = {"distance": float(distance.detach())}
-        yield Step(0, iteration + 1, float(loss.detach()), terms, code.detach().clone(), time.perf_counter() - began)
-
-
-def on_surface(points: Float[Tensor, "n 3"]) -> Float[Tensor, "n 4"]:
-    """Surface points as samples."""
-    return torch.cat([points, torch.zeros_like(points[:, :1])], dim=1)
-
-
-def around_points(
-    points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], offset: float = 0.01
-) -> Float[Tensor, "m 4"]:
-    """Samples at ± `offset` along the normals of surface points, as DeepSDF completes a depth map (section 6.3)."""
-    sides = [
-        torch.cat([points + sign * offset * normals, torch.full_like(points[:, :1], sign * offset)], dim=1)
-        for sign in (-1.0, 1.0)
-    ]
-    return torch.cat(sides)
+        losses.append(float(loss.detach()))
+    seconds = time.perf_counter() - began
+    return CodeFit(code.detach(), losses[-1], {"start 1": losses}, count * config.iterations, seconds)
