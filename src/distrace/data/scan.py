@@ -36,6 +36,8 @@ FLOOR_THICKNESS = 0.02  # of the radius
 FLOOR_TILT = 15.0  # degrees
 FLOOR_SHARE = 0.05  # of the points, at least
 FLOOR_TRIALS = 300
+FLOOR_RAYS = 2000  # just below the floor, where nothing of the object is, …
+FLOOR_REACH = 1.5  # … within so many radii of its middle
 TOLD_TILT = 0.1  # radians: an object's own up is that near to the one that is told, or to the floor's normal
 PITCHED_TILT = 0.15  # radians: the same about the candidates of a camera's frame
 PITCHES = (0.0, 15.0, 30.0)  # degrees, by which a camera looks down
@@ -145,7 +147,28 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up
             hits = mask & ~scene.seen
     depth = scene.depth.masked_fill(behind, torch.inf)
     view = View(scene.camera, scene.depth.masked_fill(~inside, torch.inf), mask)
-    return _scan(points[kept], *_rays(scene.camera, depth, free & around, hits), up, (view,))
+    rays, until, hit_rays = _rays(scene.camera, depth, free & around, hits)
+    if floor is not None:
+        below = _below(floor, points[kept])
+        rays = _joined_rays([rays, below])
+        until = torch.cat([until, torch.full((len(below.origins),), torch.inf)])
+    return _scan(points[kept], rays, until, hit_rays, up, (view,))
+
+
+def _below(floor: "Floor", points: Float[Tensor, "n 3"]) -> Rays:
+    """Returns level rays just below the floor, under the object: nothing of it is there."""
+    random = torch.Generator().manual_seed(0)
+    side = torch.linalg.cross(floor.normal, floor.normal.roll(1) + 0.1)
+    side = side / side.norm()
+    level = torch.stack([side, torch.linalg.cross(floor.normal, side)])
+    angles = 2 * np.pi * torch.rand(FLOOR_RAYS, generator=random)
+    directions = angles.cos()[:, None] * level[0] + angles.sin()[:, None] * level[1]
+    radius = _radius(points)
+    centre = points.median(0).values
+    centre = centre - (centre @ floor.normal - floor.height + floor.thickness) * floor.normal
+    across = torch.linalg.cross(floor.normal.expand_as(directions), directions)
+    offsets = FLOOR_REACH * radius * (2 * torch.rand(FLOOR_RAYS, 1, generator=random) - 1)
+    return Rays(centre + offsets * across - 2 * FLOOR_REACH * radius * directions, directions)
 
 
 def _behind(
