@@ -18,10 +18,10 @@ BLOCKED = 0.03  # of the size: a shape that far before the end of a ray blocks i
 INSIDE = (0.005, 0.01, 0.02, 0.04)  # of the size: so far behind a point there is an inside
 MOST_RAYS = 600
 MOST_NOISE = 0.02  # of the size, that excuses a distance
-SEEN = (0.7, 0.3)  # share of its length along each axis that was seen, of what is trusted, and of what has not failed
+SEEN = (0.65, 0.15)  # share of its length along each axis that was seen, of what is trusted, and of what has not failed
 SURFACE_POINTS = 500
 OUTER = (0.02, 0.98)  # quantiles between which points or a surface span
-TRUSTED = (0.85, 0.05, 0.08)  # least explained, most blocked, most disagreement
+TRUSTED = (0.9, 0.1, 0.05)  # least explained, most blocked, most disagreement
 FAILED = (0.7, 0.2)  # least explained, most blocked
 SILHOUETTE = (0.85, 0.6)  # least intersection over union of what is trusted, and of what has not failed
 
