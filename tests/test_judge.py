@@ -21,9 +21,9 @@ def directions(count: int) -> Tensor:
 
 
 def scan() -> Scan:
-    """The front half of a sphere, seen from far along z."""
+    """The front of a sphere, seen along z, and a little of what is behind."""
     points = directions(2000)
-    return scan_of_points(PLACE.to_world(0.6 * points[points[:, 2] > 0]), Up.told("y"))
+    return scan_of_points(PLACE.to_world(0.6 * points[points[:, 2] > -0.5]), Up.told("y"))
 
 
 def with_rays(seen: Scan, x: Tensor) -> Scan:
@@ -58,7 +58,13 @@ def test_a_shape_far_larger_than_what_was_seen_is_doubtful() -> None:
     verdict = judged(cap, SPHERE, PLACE)
     assert verdict.explained > 0.99
     assert verdict.name in ("doubtful", "failed")
-    assert "reach over" in verdict.reason
+    assert "span" in verdict.reason
+
+
+def test_a_field_that_is_nowhere_negative_explains_nothing() -> None:
+    assert judged(scan(), lambda points: SPHERE(points).abs() + 1e-3, PLACE).explained == 0
+    thin = judged(scan(), lambda points: SPHERE(points).abs() - 3e-3, PLACE)
+    assert thin.explained > 0.99
 
 
 def test_another_fit_elsewhere_makes_it_doubtful() -> None:

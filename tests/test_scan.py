@@ -83,6 +83,20 @@ def test_a_rectangle_leaves_out_the_floor_and_other_things() -> None:
     assert len(scan.points) > 0.8 * int(mask.sum())
 
 
+def test_nothing_is_below_the_floor() -> None:
+    scene, mask = room()
+    scan = scan_of_view(scene, mask, Up.told("y"))
+    level = scan.free.directions[:, 1].abs() < 0.02
+    heights = scan.free.origins[level, 1]
+    assert int(level.sum()) > 1000
+    assert (heights < -RADIUS).all()
+    assert (heights > -1.2 * RADIUS).all()
+    nearest = -(scan.free.origins[level] * scan.free.directions[level]).sum(1)
+    ahead = scan.free[level].at(nearest)
+    assert (ahead[:, [0, 2]].norm(dim=-1) < 2 * RADIUS).float().mean() > 0.9, "they pass under the ball"
+    assert scan.free_until[level].isinf().all()
+
+
 @pytest.mark.parametrize("pitch", [0.0, 25.0, 40.0])
 def test_the_floor_tells_up_in_a_cameras_frame(pitch: float) -> None:
     scene, mask = room(pitch)

@@ -69,6 +69,7 @@ class Placed:
     verdict: str
     explained: float
     blocked: float
+    seen: float
     disagreement: float
     seconds: float
     evaluations: int
@@ -120,6 +121,7 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
         fit.verdict.name,
         fit.verdict.explained,
         fit.verdict.blocked,
+        fit.verdict.seen,
         fit.verdict.disagreement,
         fit.seconds,
         fit.evaluations,

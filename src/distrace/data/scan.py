@@ -29,13 +29,16 @@ RADIUS_FACTOR = 1.25  # … which is this × their largest distance from the med
 BACKGROUND = 0.2  # radii behind the farthest point of the object: there nothing of it is
 FAR_OUTLIER = 2.0  # × the radius: points farther from the median are no part of the object
 NEIGHBOURS = 16  # of a point, which tell the noise
-CELLS = 32  # along the object: pieces of it touch in such cells
+CELLS = 64  # along the object, at most: pieces of it touch in such cells, …
+SPACING = 3.0  # … which are at least so many distances of neighbouring points wide
 PIECE_SHARE = 0.2  # of the largest piece's points: so large a piece is another part of the object
-PIECE_MARGIN = 0.1  # of the largest piece's box, around it: points within belong to the object
+PIECE_GAP = 0.05  # of the length of these parts: a small piece that near to them is the object's, too
 FLOOR_THICKNESS = 0.02  # of the radius
 FLOOR_TILT = 15.0  # degrees
 FLOOR_SHARE = 0.05  # of the points, at least
 FLOOR_TRIALS = 300
+FLOOR_RAYS = 2000  # just below the floor, where nothing of the object is, …
+FLOOR_REACH = 1.5  # … within so many radii of its middle
 TOLD_TILT = 0.1  # radians: an object's own up is that near to the one that is told, or to the floor's normal
 PITCHED_TILT = 0.15  # radians: the same about the candidates of a camera's frame
 PITCHES = (0.0, 15.0, 30.0)  # degrees, by which a camera looks down
@@ -145,7 +148,28 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up
             hits = mask & ~scene.seen
     depth = scene.depth.masked_fill(behind, torch.inf)
     view = View(scene.camera, scene.depth.masked_fill(~inside, torch.inf), mask)
-    return _scan(points[kept], *_rays(scene.camera, depth, free & around, hits), up, (view,))
+    rays, until, hit_rays = _rays(scene.camera, depth, free & around, hits)
+    if floor is not None:
+        below = _below(floor, points[kept])
+        rays = _joined_rays([rays, below])
+        until = torch.cat([until, torch.full((len(below.origins),), torch.inf)])
+    return _scan(points[kept], rays, until, hit_rays, up, (view,))
+
+
+def _below(floor: "Floor", points: Float[Tensor, "n 3"]) -> Rays:
+    """Returns level rays just below the floor, under the object: nothing of it is there."""
+    random = torch.Generator().manual_seed(0)
+    side = torch.linalg.cross(floor.normal, floor.normal.roll(1) + 0.1)
+    side = side / side.norm()
+    level = torch.stack([side, torch.linalg.cross(floor.normal, side)])
+    angles = 2 * np.pi * torch.rand(FLOOR_RAYS, generator=random)
+    directions = angles.cos()[:, None] * level[0] + angles.sin()[:, None] * level[1]
+    radius = _radius(points)
+    centre = points.median(0).values
+    centre = centre - (centre @ floor.normal - floor.height + floor.thickness) * floor.normal
+    across = torch.linalg.cross(floor.normal.expand_as(directions), directions)
+    offsets = FLOOR_REACH * radius * (2 * torch.rand(FLOOR_RAYS, 1, generator=random) - 1)
+    return Rays(centre + offsets * across - 2 * FLOOR_REACH * radius * directions, directions)
 
 
 def _behind(
@@ -248,18 +272,25 @@ def find_floor(points: Float[Tensor, "n 3"], up: Up) -> Floor | None:
 
 
 def object_points(points: Float[Tensor, "n 3"], floor: Floor | None, share: float = PIECE_SHARE) -> Bool[Tensor, "n"]:
-    """Returns which points belong to the largest pieces: those of the floor, and of small separate pieces, do not."""
+    """Returns which points belong to the largest pieces and what is near them; the floor's do not."""
+    from scipy.spatial import KDTree
+
     kept = torch.ones(len(points), dtype=torch.bool)
     if floor is not None:
         kept = points @ floor.normal - floor.height > 1.5 * floor.thickness
     if kept.sum() < LEAST_POINTS:
         return torch.ones_like(kept)
-    pieces = _pieces(points[kept])
+    candidates = points[kept]
+    pieces = _pieces(candidates)
     counts = pieces.bincount()
-    largest = points[kept][counts[pieces] >= share * counts.max()]
-    low, high = largest.amin(0), largest.amax(0)
-    margin = PIECE_MARGIN * (high - low)
-    return kept & ((points >= low - margin) & (points <= high + margin)).all(-1)
+    is_main = (counts >= share * counts.max())[pieces]
+    main = candidates[is_main]
+    gap = PIECE_GAP * float((main.amax(0) - main.amin(0)).max())
+    away, _ = KDTree(main.double().numpy()).query(candidates.double().numpy())
+    nearest = torch.full((len(counts),), torch.inf, dtype=torch.float64)
+    nearest.scatter_reduce_(0, pieces, torch.from_numpy(away), "amin")
+    kept[kept.clone()] = nearest[pieces] <= gap
+    return kept
 
 
 def _load(path: Path, options: ScanOptions) -> Scan:
@@ -355,9 +386,12 @@ def _noise(points: Float[Tensor, "n 3"]) -> float:
 def _pieces(points: Float[Tensor, "n 3"]) -> Tensor:
     """The number of each point's piece: pieces are connected cells of a grid."""
     from scipy.ndimage import label
+    from scipy.spatial import KDTree
 
     low = points.amin(0)
-    width = float((points - low).max()) / CELLS or 1.0
+    some = points[:: max(len(points) // 1000, 1)].double().numpy()
+    apart, _ = KDTree(points.double().numpy()).query(some, 2)
+    width = max(float((points - low).max()) / CELLS, SPACING * float(np.median(apart[:, 1]))) or 1.0
     cell = ((points - low) / width).long()
     occupied = np.zeros((CELLS + 2,) * 3, dtype=bool)
     occupied[tuple(cell.T.numpy())] = True

@@ -16,12 +16,12 @@ from distrace.fitting.judge import Verdict, disagreement_of, judged, surface_poi
 from distrace.fitting.proposals import proposed, proposed_codes
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample, Start
-from distrace.fitting.solver import SolverConfig, geman_mcclure
+from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
 JUDGED_POINTS = 500
-SOLVER = SolverConfig(damping=1e-2, kernel=geman_mcclure, settled=1e-3)
+SOLVER = SolverConfig(damping=1e-2, settled=1e-3)
 EQUAL = 0.15  # of the least loss: an end that is no worse by more may be right as well
 
 
@@ -30,9 +30,9 @@ class ScanFitConfig:
     """The rounds of a fit, coarse to fine."""
 
     rounds: tuple[Round, ...] = (
-        Round(16, 7, 32, 100, 80, 6, 0.06),
+        Round(16, 7, 32, 100, 80, 6, 0.06, charbonnier),
         Round(5, 7, 64, 250, 150, 8, 0.03),
-        Round(2, 10, 256, 500, 300, 10, 0.015),
+        Round(3, 10, 256, 500, 300, 10, 0.015),
     )
     seed: int = 0
 

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.data.scan import Scan
@@ -15,10 +15,13 @@ from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 NEAR = 0.03  # of the size: a point that near to the surface is explained by it
 BLOCKED = 0.03  # of the size: a shape that far before the end of a ray blocks it
+INSIDE = (0.005, 0.01, 0.02, 0.04)  # of the size: so far behind a point there is an inside
 MOST_RAYS = 600
 MOST_NOISE = 0.02  # of the size, that excuses a distance
-LEAST_REACH = (0.4, 0.2)  # radius of the scan in sizes, least of what is trusted, and of what has not failed
-TRUSTED = (0.85, 0.05, 0.08)  # least explained, most blocked, most disagreement
+SEEN = (0.65, 0.15)  # share of its length along each axis that was seen, of what is trusted, and of what has not failed
+SURFACE_POINTS = 500
+OUTER = (0.02, 0.98)  # quantiles between which points or a surface span
+TRUSTED = (0.9, 0.1, 0.05)  # least explained, most blocked, most disagreement
 FAILED = (0.7, 0.2)  # least explained, most blocked
 SILHOUETTE = (0.85, 0.6)  # least intersection over union of what is trusted, and of what has not failed
 
@@ -30,6 +33,7 @@ class Verdict:
     name: str
     explained: float  # share of the scan's points that lie near the surface
     blocked: float  # share of the rays of free space, of those near the object, that pass through the shape
+    seen: float  # share of the shape's length that the points span, along the axis where it is least
     disagreement: float  # how far the other good ends lie from the surface, in sizes; 0 where there are none
     silhouette: float | None  # intersection over union with the mask, where that is the object's alone
     reason: str
@@ -39,6 +43,7 @@ class Verdict:
             "verdict": self.name,
             "explained": round(self.explained, 4),
             "free_space_violated": round(self.blocked, 4),
+            "extent_seen": round(self.seen, 4),
             "disagreement": round(self.disagreement, 4),
             "silhouette_iou": self.silhouette if self.silhouette is None else round(self.silhouette, 4),
             "reason": self.reason,
@@ -50,8 +55,10 @@ def judged(
     scan: Scan, sdf: SDF, place: Similarity, disagreement: float = 0.0, silhouette: float | None = None
 ) -> Verdict:
     """Returns the verdict on a placed shape. `disagreement` is that of the other ends: `disagreement_of`."""
-    near = distances(scan.points, sdf, place, scan.noise) < NEAR
+    near = (distances(scan.points, sdf, place, scan.noise) < NEAR) & _have_inside(place.to_object(scan.points), sdf)
     explained = float(near.float().mean()) if len(near) else 1.0
+    surface = surface_points(sdf, SURFACE_POINTS, scan.points)
+    seen = _extent_seen(place.to_object(scan.points[near]), surface) if len(near) else 1.0
     blocked = _blocked_share(scan, sdf, place)
     reasons = []
     if explained < TRUSTED[0]:
@@ -60,18 +67,39 @@ def judged(
         reasons.append(f"the shape blocks {blocked:.0%} of the rays that saw through it")
     if disagreement > TRUSTED[2]:
         reasons.append(f"another fit that is as good lies {disagreement:.0%} of the size away")
-    reach = scan.radius / float(place.scale) if len(near) else 1.0
-    if reach < LEAST_REACH[0]:
-        reasons.append(f"the points reach over {reach:.0%} of the shape")
+    if seen < SEEN[0]:
+        reasons.append(f"the points span {seen:.0%} of its length along one axis: the rest is a guess")
     overlap = 1.0 if silhouette is None else silhouette
     if overlap < SILHOUETTE[0]:
         reasons.append(f"its silhouette and the mask have an intersection over union of {overlap:.0%}")
-    failed = explained < FAILED[0] or blocked > FAILED[1] or reach < LEAST_REACH[1] or overlap < SILHOUETTE[1]
+    failed = explained < FAILED[0] or blocked > FAILED[1] or seen < SEEN[1] or overlap < SILHOUETTE[1]
     name = "failed" if failed else "doubtful" if reasons else "trusted"
     usual = (
         f"{explained:.0%} of the points lie on the surface, and it blocks {blocked:.0%} of the rays that saw through"
     )
-    return Verdict(name, explained, blocked, disagreement, silhouette, "; ".join(reasons) or usual)
+    return Verdict(name, explained, blocked, seen, disagreement, silhouette, "; ".join(reasons) or usual)
+
+
+def _have_inside(points: Float[Tensor, "n 3"], sdf: SDF) -> Bool[Tensor, "n"]:
+    """Returns whether the inside is near: about thin sheets a field may be small and never negative."""
+    with torch.enable_grad():
+        at = points.detach().requires_grad_()
+        values = sdf(at)
+        (slopes,) = torch.autograd.grad(values.sum(), at)
+    inwards = -torch.nn.functional.normalize(slopes, dim=-1)
+    depths = points.new_tensor(INSIDE)
+    behind = sdf(points[:, None] + depths[:, None] * inwards[:, None])
+    return (values.detach() < 0) | (behind < 0).any(1)
+
+
+def _extent_seen(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 3"]) -> float:
+    """Returns the least share, over the object's axes, of the surface's length that points span; outliers left out."""
+    if not len(points) or not len(surface):
+        return 0.0
+    quantiles = points.new_tensor(OUTER)
+    spanned = points.quantile(quantiles, dim=0).diff(dim=0)[0]
+    length = surface.quantile(quantiles, dim=0).diff(dim=0)[0]
+    return float((spanned / length.clamp_min(1e-6)).min().clamp(0, 1))
 
 
 def distances(points: Float[Tensor, "n 3"], sdf: SDF, place: Similarity, noise: float = 0.0) -> Float[Tensor, "n"]:

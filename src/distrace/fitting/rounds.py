@@ -7,7 +7,7 @@ from math import inf
 from torch.nn.functional import pad
 
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem
-from distrace.fitting.solver import Descent, SolverConfig, descend
+from distrace.fitting.solver import Descent, Kernel, SolverConfig, cauchy, descend
 
 Progress = Callable[[int], None]
 """Takes the number of iterations that are done."""
@@ -24,6 +24,7 @@ class Round:
     rays: int
     samples: int  # on each ray, at which its least value is sought
     deviation: float  # of the shape from the observation, in its unit
+    kernel: Kernel = cauchy
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ def run_rounds(
     done = 0
     for stage in rounds:
         problem = problem_of(stage)
+        solver = replace(solver, kernel=stage.kernel)
         begins = [_with_dimensions(state, stage.dimensions) for state in ends[: stage.starts]]
         residuals = problem.residuals(begins)
         descents = [Descent(*each, solver.damping) for each in zip(begins, residuals, strict=True)]

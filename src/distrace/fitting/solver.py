@@ -31,12 +31,6 @@ def charbonnier(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[
     return 2 * squared / (1 + root), 1 / root  # 2 (√(1 + x) − 1), but exact where 1 + x rounds to 1
 
 
-def geman_mcclure(squared: Float[Tensor, "n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Outliers do not count at all (Geman and McClure 1987)."""
-    share = 1 / (1 + squared)
-    return squared * share, share.square()
-
-
 @dataclass(frozen=True)
 class SolverConfig:
     """Residuals beyond `scale` count less, as the kernel has it; it starts wider, so that a far start is no outlier."""
