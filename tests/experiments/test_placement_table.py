@@ -55,7 +55,9 @@ def test_errors_are_those_of_the_nearest_equal_turn() -> None:
 
 
 def result(shape: str, told: bool, chamfer: float, degrees: float, verdict: str) -> Placed:
-    return Placed(PlacedTrial("sofas", shape, 0, told), degrees, 1.0, 1.0, chamfer, verdict, 1.0, 0.0, 1.0, 0.0, 5.0, 100)
+    return Placed(
+        PlacedTrial("sofas", shape, 0, told), degrees, 1.0, 1.0, chamfer, verdict, 1.0, 0.0, 1.0, 0.0, 5.0, 100
+    )
 
 
 def test_rows_tell_shares_and_ratios() -> None:
