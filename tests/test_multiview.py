@@ -24,13 +24,13 @@ from distrace.render import render
 def model(tmp_path: Path) -> Path:
     random = torch.Generator().manual_seed(2)
     codes = torch.cat([0.3 * torch.randn(4, 4, generator=random), torch.zeros(1, 4)])
-    save_model(tmp_path / "balls", Model("balls", bumpy_balls(), codes, tuple("abcde")), torch.float32)
+    save_model(tmp_path / "balls", Model("balls", bumpy_balls(0.4), codes, tuple("abcde")), torch.float32)
     return tmp_path / "balls"
 
 
 @torch.no_grad()
 def save_views(folder: Path, cameras: list[Camera]) -> None:
-    field = bumpy_balls().field(TRUE)
+    field = bumpy_balls(0.4).field(TRUE)
     images = [shade(render(field, camera), paint, GREY) for camera in cameras]
     views = [
         Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))

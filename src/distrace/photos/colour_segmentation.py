@@ -70,4 +70,5 @@ def _histogram(appearances: Float[Tensor, "n 4"]) -> Float[Tensor, "roughness bi
     levels = 1 + len(ROUGHNESS_LEVELS)
     bin_index = ((appearances[:, 3].long() * BINS + red) * BINS + green) * BINS + blue
     counts = torch.bincount(bin_index, minlength=levels * BINS**3).reshape(levels, BINS, BINS, BINS).to(appearances)
-    return avg_pool3d(counts, 3, 1, 1) / max(len(appearances), 1)
+    smooth = avg_pool3d(avg_pool3d(counts, 2, 1, 1), 2, 1)  # two pairs make the weights 1, 2, 1
+    return smooth / max(len(appearances), 1)
