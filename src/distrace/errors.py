@@ -32,6 +32,8 @@ def explained(sentence: str, file: Path | None = None) -> Generator[None, None, 
     except Exception as error:
         if isinstance(error, MissingLibrary) or (isinstance(error, OSError) and error.errno in NO_SPACE):
             raise
+        if file is not None and not file.exists():
+            raise ValueError(f"{file} does not exist") from error
         cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]
         cause = f"no key {cause}" if isinstance(error, KeyError) else cause
         cause = (file and _stand_in(file)) or cause

@@ -91,7 +91,7 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
             raise
-        _end(program, "not enough memory; use a smaller size, or --device cpu", 2)
+        _end(program, "not enough memory; use a smaller size, or another device", 2)
 
 
 def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "distrace", about: str = ABOUT) -> Any:

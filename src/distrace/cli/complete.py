@@ -69,17 +69,28 @@ class Complete:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        if self.plausible < 0 or (self.points is not None and self.points < 1):
-            given = f"--plausible {self.plausible} and --points {self.points}"
-            raise ValueError(f"{given} were given; one cannot be negative, and at least one point is needed")
+        if self.plausible < 0:
+            raise ValueError(f"--plausible {self.plausible} was given; it cannot be negative")
+        if self.points is not None and self.points < 1:
+            raise ValueError(f"--points {self.points} was given; at least 1 is needed")
         if not self.inputs:
             raise ValueError("no input was given; give a depth image, an observation or a cloud of points")
         mesh = MeshConfig(self.resolution, device=run.device)
         frame = self.frame or ("canonical" if all(map(is_canonical, self.inputs)) else "input")
+        self._refuse(frame)
         with run.noticing():
             verdict = self._canonical(run, mesh) if frame == "canonical" else self._placed(run, mesh)
         if self.strict and verdict.name == "failed":
             sys.exit(FAILED)
+
+    def _refuse(self, frame: str) -> None:
+        """Raises `ValueError` for options of the other frame, which would do nothing."""
+        names = ("up", "intrinsics", "mask", "box")
+        if frame == "input":
+            names = ("ignore", "solver", "iterations", "starts", "plausible")
+        for name in names:
+            if getattr(self, name) != getattr(type(self), name):
+                raise ValueError(f"--{name} was given, which --frame {frame} does not use; leave it out")
 
     def _placed(self, run: Run, mesh: MeshConfig) -> Verdict:
         scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box))

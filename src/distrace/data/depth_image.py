@@ -28,8 +28,9 @@ def load_depth_image(path: Path) -> Float[Tensor, "height width"]:
         kind = path.suffix.lower()
         values = _exr(path) if kind == ".exr" else _array(path) if kind == ".npy" else _picture(path)
         depth = depth_image(values)
+    with about(path):
         if not depth.isfinite().any():
-            raise ValueError("no pixel has a depth")
+            raise ValueError("no pixel has a depth; it takes metres, or millimetres in a 16-bit PNG")
         typical = float(depth[depth.isfinite()].median())
         if typical > FARTHEST:
             raise ValueError(f"its depths are {typical:.4g} m in the median; are they in millimetres?")
@@ -56,9 +57,10 @@ def load_mask(path: Path, height: int, width: int) -> Bool[Tensor, "height width
     with explained(f"{path} cannot be read as a mask: give a picture that is white where the object is", path):
         with Image.open(path) as picture:
             values = np.asarray(picture.convert("L"))
+    with about(path):
         mask = mask_image(values > values.max() / 2 if values.max() else values, height, width)
         if not mask.any():
-            raise ValueError("it marks no pixel")
+            raise ValueError("the mask marks no pixel; it is white where the object is")
     return mask
 
 

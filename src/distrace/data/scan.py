@@ -295,7 +295,10 @@ def object_points(points: Float[Tensor, "n 3"], floor: Floor | None, share: floa
 
 def _load(path: Path, options: ScanOptions) -> Scan:
     kind = path.suffix.lower()
+    if kind not in KINDS:
+        _refuse(path, "is a depth image's", intrinsics=options.intrinsics)
     if kind in CLOUDS:
+        _refuse(path, "is an image's", mask=options.mask, box=options.box)
         points = torch.from_numpy(read_points(path)).float()
         with about(path):
             return scan_of_points(points, Up.told(options.up or "y"))
@@ -310,6 +313,13 @@ def _load(path: Path, options: ScanOptions) -> Scan:
         up = Up.told(options.up) if options.up else Up.of_camera()
     with about(path):
         return _scan_of_image(scene, mask, options, up)
+
+
+def _refuse(path: Path, whose: str, **given: object) -> None:
+    """Raises `ValueError` for an option that says nothing about such a file."""
+    for name, value in given.items():
+        if value is not None:
+            raise ValueError(f"--{name} was given for {path}, and {whose} alone; leave it out")
 
 
 def _scan_of_image(scene: View, mask: Bool[Tensor, "height width"] | None, options: ScanOptions, up: Up) -> Scan:

@@ -74,9 +74,11 @@ def judged(
         reasons.append(f"its silhouette and the mask have an intersection over union of {overlap:.0%}")
     failed = explained < FAILED[0] or blocked > FAILED[1] or seen < SEEN[1] or overlap < SILHOUETTE[1]
     name = "failed" if failed else "doubtful" if reasons else "trusted"
-    usual = (
-        f"{explained:.0%} of the points lie on the surface, and it blocks {blocked:.0%} of the rays that saw through"
-    )
+    usual = f"{explained:.0%} of the points lie on the surface, and "
+    if len(scan.free_until):
+        usual += f"it blocks {blocked:.0%} of the rays that saw through"
+    else:
+        usual += "no free space is known"
     return Verdict(name, explained, blocked, seen, disagreement, silhouette, "; ".join(reasons) or usual)
 
 
