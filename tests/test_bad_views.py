@@ -144,7 +144,7 @@ def test_a_file_cut_off_anywhere_ends_in_one_sentence(tmp_path: Path, kept: floa
 def test_too_many_pixels_are_refused_before_they_fill_the_memory(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(reading, "LARGEST", 1000)
+    monkeypatch.setattr(reading, "MAX_PIXELS", 1000)
     with pytest.raises(ValueError, match=r"depth has shape \[32, 40\]; .* of 1 to 1,000 pixels"):
         load_view(stored(tmp_path, ("depth",), {}))
 

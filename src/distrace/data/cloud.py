@@ -98,7 +98,7 @@ def _read(path: Path, advice: str) -> tuple[Float[np.ndarray, "n 3"], Float[np.n
 
 def _finite(path: Path, points: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     with np.errstate(over="ignore"):  # what is too large for float32 becomes inf
-        usable = np.isfinite(points.astype(np.float32)).all(1)
+        usable = np.asarray(np.isfinite(points.astype(np.float32)).all(1))
     if not usable.any():
         raise ValueError(f"{path}: it has {len(points)} points, and none that is finite")
     return usable
