@@ -35,7 +35,8 @@ def explained(sentence: str, file: Path | None = None) -> Generator[None, None, 
         if file is not None and not file.exists():
             raise ValueError(f"{file} does not exist") from error
         cause = re.split(r"\.?\s*\n|\.\s", str(error).strip())[0]
-        cause = f"no key {cause}" if isinstance(error, KeyError) else cause
+        if isinstance(error, KeyError):
+            cause = "no key " + cause.replace(" is not a file in the archive", "")  # as NumPy says it
         cause = (file and _stand_in(file)) or cause
         raise ValueError(f"{sentence} ({cause})" if cause else sentence) from error
 

@@ -56,9 +56,7 @@ class Sample:
     def run(self) -> None:
         run = start(self.out)
         if not self.meshes.is_dir():
-            raise ValueError(
-                f"{self.meshes} is no folder of meshes; `distrace data furniture --out {self.meshes}` makes one"
-            )
+            raise ValueError(f"{self.meshes} is no folder of meshes; `distrace data furniture --out DIR` makes one")
         if self.count < 1000 or self.workers < 1 or self.variants < 0:
             given = f"--count {self.count} --workers {self.workers} --variants {self.variants}"
             raise ValueError(f"{given} was given; at least 1000, 1 and 0 are needed")
