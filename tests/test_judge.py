@@ -6,7 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from distrace.data.scan import Scan, Up, scan_of_points
+from distrace.data.scan import Scan, scan_of_points
+from distrace.data.up import Up
 from distrace.fields import primitives
 from distrace.fitting.judge import disagreement_of, judged, surface_points
 from distrace.pose import Similarity

@@ -6,7 +6,8 @@ import pytest
 import roma
 import torch
 
-from distrace.data.scan import Up, scan_of_points
+from distrace.data.scan import scan_of_points
+from distrace.data.up import Up
 from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.fitting.proposals import SHAPES, TURNS, Volumes, _rotations, proposed, proposed_codes, typical_codes
 from distrace.pose import Similarity

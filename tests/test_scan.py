@@ -12,7 +12,8 @@ from PIL import Image
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
-from distrace.data.scan import Scan, ScanOptions, Up, canonical_scan, joined, load_scan, scan_of_points, scan_of_view
+from distrace.data.scan import Scan, ScanOptions, canonical_scan, joined, load_scan, scan_of_points, scan_of_view
+from distrace.data.up import Up
 from distrace.errors import DoubtfulResult
 from distrace.files import save_arrays
 from distrace.rays import meet_sphere

@@ -15,8 +15,9 @@ from jaxtyping import Float
 from scipy.spatial import KDTree
 from torch import Tensor
 
-from distrace.data.scan import Up, scan_of_view
+from distrace.data.scan import scan_of_view
 from distrace.data.solid import Solid, normalised, solid_of
+from distrace.data.up import Up
 from distrace.files import save_json
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.mesh import extract_mesh

@@ -7,8 +7,9 @@ import roma
 import torch
 import trimesh
 
-from distrace.data.scan import Up, scan_of_view
+from distrace.data.scan import scan_of_view
 from distrace.data.solid import Solid, normalised
+from distrace.data.up import Up
 from distrace.pose import Similarity
 from experiments.datasets.sensor import sensed
 from experiments.tables.placement import (

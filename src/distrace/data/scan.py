@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -14,34 +13,17 @@ from distrace.camera import Camera
 from distrace.data.cloud import Cloud, read_points
 from distrace.data.depth_image import KINDS, load_depth_image, load_intrinsics, load_mask
 from distrace.data.observation import View, read_scene
+from distrace.data.points import LEAST_POINTS, noise_of, object_points, radius_of, thinned
+from distrace.data.up import TOLD_TILT, Floor, Up, find_floor, rays_below
 from distrace.errors import about
 from distrace.rays import Rays
 
-AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 CLOUDS = (".ply", ".pcd", ".xyz", ".obj", ".off", ".stl", ".glb")
-LEAST_POINTS = 20
-MOST_POINTS = 20_000
 MOST_RAYS = 6_000
 CROP = 0.5  # of the object's size in the image, around it, where rays tell what is free
 CLEAN = 0.05  # share of the background's pixels with a depth: with fewer, the mask alone tells what is background
-RADIUS_SHARE = 0.8  # of the points are surely the object's: they tell its radius, …
-RADIUS_FACTOR = 1.25  # … which is this × their largest distance from the median
 BACKGROUND = 0.2  # radii behind the farthest point of the object: there nothing of it is
 FAR_OUTLIER = 2.0  # × the radius: points farther from the median are no part of the object
-NEIGHBOURS = 16  # of a point, which tell the noise
-CELLS = 64  # along the object, at most: pieces of it touch in such cells, …
-SPACING = 3.0  # … which are at least so many distances of neighbouring points wide
-PIECE_SHARE = 0.2  # of the largest piece's points: so large a piece is another part of the object
-PIECE_GAP = 0.05  # of the length of these parts: a small piece that near to them is the object's, too
-FLOOR_THICKNESS = 0.02  # of the radius
-FLOOR_TILT = 15.0  # degrees
-FLOOR_SHARE = 0.05  # of the points, at least
-FLOOR_TRIALS = 300
-FLOOR_RAYS = 2000  # just below the floor, where nothing of the object is, …
-FLOOR_REACH = 1.5  # … within so many radii of its middle
-TOLD_TILT = 0.1  # radians: an object's own up is that near to the one that is told, or to the floor's normal
-PITCHED_TILT = 0.15  # radians: the same about the candidates of a camera's frame
-PITCHES = (0.0, 15.0, 30.0)  # degrees, by which a camera looks down
 NO_RAYS = Rays(torch.empty(0, 3), torch.empty(0, 3))
 
 
@@ -69,7 +51,7 @@ class Scan:
     @property
     def radius(self) -> float:
         """About the distance from the centre within which the object's points lie; a fifth may be others'."""
-        return _radius(self.points)
+        return radius_of(self.points)
 
     def to(self, device: torch.device | str) -> "Scan":
         views = tuple(view.to(device) for view in self.views)
@@ -117,10 +99,10 @@ def joined(scans: Sequence[Scan]) -> Scan:
     noise = float(np.mean([scan.noise for scan in scans]))
     views = tuple(view for scan in scans for view in scan.views)
     first = scans[0]
-    return Scan(_thinned(points), free, free_until, hits, noise, first.ups, first.tilt, views)
+    return Scan(thinned(points), free, free_until, hits, noise, first.ups, first.tilt, views)
 
 
-def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up", isolate: bool = False) -> Scan:
+def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, isolate: bool = False) -> Scan:
     """Returns the scan of the object that a mask marks in a depth image; without a mask, of all that has a depth.
 
     Separate pieces are left out. `isolate`: the mask holds other things, too, as a rectangle does; so is the floor.
@@ -130,7 +112,7 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up
     inside = scene.seen if mask is None else scene.seen & mask
     _check_count(int(inside.sum()))
     around = _around(inside)
-    floor = None if up.direction is None else find_floor(_thinned(scene.masked(around).points()), up)
+    floor = None if up.direction is None else find_floor(thinned(scene.masked(around).points()), up)
     if floor is not None:
         up = Up(floor.normal, floor.normal[None], TOLD_TILT)
     points = scene.masked(inside).points()
@@ -150,33 +132,17 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: "Up
     view = View(scene.camera, scene.depth.masked_fill(~inside, torch.inf), mask)
     rays, until, hit_rays = _rays(scene.camera, depth, free & around, hits)
     if floor is not None:
-        below = _below(floor, points[kept])
+        below = rays_below(floor, points[kept])
         rays = _joined_rays([rays, below])
         until = torch.cat([until, torch.full((len(below.origins),), torch.inf)])
     return _scan(points[kept], rays, until, hit_rays, up, (view,))
 
 
-def _below(floor: "Floor", points: Float[Tensor, "n 3"]) -> Rays:
-    """Returns level rays just below the floor, under the object: nothing of it is there."""
-    random = torch.Generator().manual_seed(0)
-    side = torch.linalg.cross(floor.normal, floor.normal.roll(1) + 0.1)
-    side = side / side.norm()
-    level = torch.stack([side, torch.linalg.cross(floor.normal, side)])
-    angles = 2 * np.pi * torch.rand(FLOOR_RAYS, generator=random)
-    directions = angles.cos()[:, None] * level[0] + angles.sin()[:, None] * level[1]
-    radius = _radius(points)
-    centre = points.median(0).values
-    centre = centre - (centre @ floor.normal - floor.height + floor.thickness) * floor.normal
-    across = torch.linalg.cross(floor.normal.expand_as(directions), directions)
-    offsets = FLOOR_REACH * radius * (2 * torch.rand(FLOOR_RAYS, 1, generator=random) - 1)
-    return Rays(centre + offsets * across - 2 * FLOOR_REACH * radius * directions, directions)
-
-
 def _behind(
-    scene: View, points: Float[Tensor, "n 3"], inside: Bool[Tensor, "height width"], floor: "Floor | None"
+    scene: View, points: Float[Tensor, "n 3"], inside: Bool[Tensor, "height width"], floor: Floor | None
 ) -> Bool[Tensor, "height width"]:
     """Where the floor is seen, or something behind the object: nothing of the object is behind that."""
-    farthest = float(scene.depth[inside].quantile(0.98)) + BACKGROUND * _radius(points)
+    farthest = float(scene.depth[inside].quantile(0.98)) + BACKGROUND * radius_of(points)
     found = scene.seen & (scene.depth > farthest)
     if floor is not None:
         height = torch.full_like(scene.depth, torch.inf)
@@ -189,14 +155,14 @@ def _rays(
     camera: Camera, depth: Tensor, free: Bool[Tensor, "height width"], hits: Bool[Tensor, "height width"]
 ) -> tuple[Rays, Float[Tensor, "m"], Rays]:
     """Returns the rays that are free up to a depth, and those that hit."""
-    chosen = _thinned(free.nonzero(), MOST_RAYS)
+    chosen = thinned(free.nonzero(), MOST_RAYS)
     pixels = camera.pixels()[chosen[:, 0], chosen[:, 1]]
     until = depth[chosen[:, 0], chosen[:, 1]] / camera.cosines(pixels)
-    chosen = _thinned(hits.nonzero(), MOST_RAYS)
+    chosen = thinned(hits.nonzero(), MOST_RAYS)
     return camera.rays(pixels), until, camera.rays(camera.pixels()[chosen[:, 0], chosen[:, 1]])
 
 
-def scan_of_points(points: Float[Tensor, "n 3"], up: "Up") -> Scan:
+def scan_of_points(points: Float[Tensor, "n 3"], up: Up) -> Scan:
     """Returns the scan of a cloud, of which nobody says from where it was seen. Raises `ValueError` for few points."""
     _check_count(len(points))
     return _scan(points, NO_RAYS, points.new_empty(0), NO_RAYS, up, ())
@@ -206,91 +172,11 @@ def canonical_scan(seen: View | Cloud) -> Scan:
     """Returns what was seen of a shape that lies as the model's do; it may be a silhouette alone."""
     up = Up.told("y").candidates
     if isinstance(seen, Cloud):
-        return Scan(seen.points, NO_RAYS, torch.empty(0), NO_RAYS, _noise(seen.points), up)
+        return Scan(seen.points, NO_RAYS, torch.empty(0), NO_RAYS, noise_of(seen.points), up)
     points = seen.points()
     free = seen.seen if seen.mask is None else seen.seen | ~seen.mask
     hits = torch.zeros_like(free) if seen.mask is None else seen.mask & ~seen.seen
-    return Scan(points, *_rays(seen.camera, seen.depth, free, hits), _noise(points), up, views=(seen,))
-
-
-@dataclass(frozen=True)
-class Up:
-    """Where an object's own up may point: near one of several directions, of which one is the most likely."""
-
-    direction: Float[Tensor, "3"] | None  # None where nothing is known
-    candidates: Float[Tensor, "k 3"]
-    tilt: float
-
-    @staticmethod
-    def told(axis: str) -> "Up":
-        """Returns what a user says: an axis of `AXES`, or `unknown`."""
-        if axis == "unknown":
-            return Up(None, torch.empty(0, 3), torch.inf)
-        direction = torch.tensor(AXES[axis], dtype=torch.float32)
-        return Up(direction, direction[None], TOLD_TILT)
-
-    @staticmethod
-    def of_camera() -> "Up":
-        """Returns what is likely in a camera's frame, whose y points down: cameras look level, or down."""
-        pitches = torch.deg2rad(torch.tensor(PITCHES))
-        candidates = torch.stack([torch.zeros(len(PITCHES)), -pitches.cos(), -pitches.sin()], dim=1)
-        return Up(candidates[0], candidates, PITCHED_TILT)
-
-
-@dataclass(frozen=True)
-class Floor:
-    """A plane: `normal` · x = `height`; what lies less than `thickness` above it belongs to it."""
-
-    normal: Float[Tensor, "3"]
-    height: float
-    thickness: float
-
-
-def find_floor(points: Float[Tensor, "n 3"], up: Up) -> Floor | None:
-    """Returns the largest plane across up that has hardly any point below it (RANSAC), or None."""
-    assert up.direction is not None
-    random = torch.Generator().manual_seed(0)
-    thickness = FLOOR_THICKNESS * _radius(points)
-    points = _thinned(points, 2000)
-    triples = points[torch.randint(len(points), (FLOOR_TRIALS, 3), generator=random)]
-    normals = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
-    normals = torch.nn.functional.normalize(normals, dim=-1)
-    normals = normals * (normals @ up.direction).sign()[:, None]
-    heights = (triples[:, 0] * normals).sum(-1)
-    above = points @ normals.T - heights
-    on_plane = (above.abs() < thickness).float().mean(0)
-    below = (above < -2 * thickness).float().mean(0)
-    degrees = FLOOR_TILT + (max(PITCHES) if len(up.candidates) > 1 else 0.0)
-    fits = (normals @ up.direction > np.cos(np.radians(degrees))) & (below < 0.1 * on_plane) & (on_plane > FLOOR_SHARE)
-    if not fits.any():
-        return None
-    best = torch.where(fits, on_plane, 0.0).argmax()
-    supports = points[above[:, best].abs() < thickness]
-    normal = torch.linalg.svd(supports - supports.mean(0))[2][-1]
-    normal = normal * (normal @ up.direction).sign()
-    return Floor(normal, float(supports.mean(0) @ normal), thickness)
-
-
-def object_points(points: Float[Tensor, "n 3"], floor: Floor | None, share: float = PIECE_SHARE) -> Bool[Tensor, "n"]:
-    """Returns which points belong to the largest pieces and what is near them; the floor's do not."""
-    from scipy.spatial import KDTree
-
-    kept = torch.ones(len(points), dtype=torch.bool)
-    if floor is not None:
-        kept = points @ floor.normal - floor.height > 1.5 * floor.thickness
-    if kept.sum() < LEAST_POINTS:
-        return torch.ones_like(kept)
-    candidates = points[kept]
-    pieces = _pieces(candidates)
-    counts = pieces.bincount()
-    is_main = (counts >= share * counts.max())[pieces]
-    main = candidates[is_main]
-    gap = PIECE_GAP * float((main.amax(0) - main.amin(0)).max())
-    away, _ = KDTree(main.double().numpy()).query(candidates.double().numpy())
-    nearest = torch.full((len(counts),), torch.inf, dtype=torch.float64)
-    nearest.scatter_reduce_(0, pieces, torch.from_numpy(away), "amin")
-    kept[kept.clone()] = nearest[pieces] <= gap
-    return kept
+    return Scan(points, *_rays(seen.camera, seen.depth, free, hits), noise_of(points), up, views=(seen,))
 
 
 def _load(path: Path, options: ScanOptions) -> Scan:
@@ -339,27 +225,16 @@ def _scan_of_image(scene: View, mask: Bool[Tensor, "height width"] | None, optio
 
 def _scan(points: Tensor, free: Rays, free_until: Tensor, hits: Rays, up: Up, views: tuple[View, ...]) -> Scan:
     """Leaves out what is far from everything, and tells the noise."""
-    points = _thinned(points)
+    points = thinned(points)
     away = (points - points.median(0).values).norm(dim=-1)
-    points = points[away <= FAR_OUTLIER * _radius(points)]
+    points = points[away <= FAR_OUTLIER * radius_of(points)]
     if not float((points - points[0]).norm(dim=-1).max()) > 0:
         raise ValueError(f"all of its {len(points)} points are in one place")
-    return Scan(points, free, free_until, hits, _noise(points), up.candidates, up.tilt, views)
-
-
-def _radius(points: Float[Tensor, "n 3"]) -> float:
-    away = (points - points.median(0).values).norm(dim=-1)
-    return RADIUS_FACTOR * float(away.quantile(RADIUS_SHARE))
+    return Scan(points, free, free_until, hits, noise_of(points), up.candidates, up.tilt, views)
 
 
 def _joined_rays(rays: Sequence[Rays]) -> Rays:
     return Rays(torch.cat([each.origins for each in rays]), torch.cat([each.directions for each in rays]))
-
-
-def _thinned(rows: Tensor, most: int = MOST_POINTS) -> Tensor:
-    if len(rows) <= most:
-        return rows
-    return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:most]]
 
 
 def _check_count(count: int) -> None:
@@ -377,33 +252,3 @@ def _around(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"
         spans.append(slice(max(int(occupied[0]) - margin, 0), int(occupied[-1]) + margin + 1))
     found[spans[0], spans[1]] = True
     return found
-
-
-def _noise(points: Float[Tensor, "n 3"]) -> float:
-    """The median distance of points from the plane through their neighbours."""
-    from scipy.spatial import KDTree
-
-    if len(points) < NEIGHBOURS:
-        return 0.0
-    count = NEIGHBOURS
-    chosen = points[:: max(len(points) // 1000, 1)].double().numpy()
-    _, near = KDTree(points.double().numpy()).query(chosen, count)
-    around = points.double().numpy()[near]
-    flatness = np.linalg.svd(around - around.mean(1, keepdims=True), compute_uv=False)[:, -1]
-    return float(np.median(flatness) / np.sqrt(count))
-
-
-def _pieces(points: Float[Tensor, "n 3"]) -> Tensor:
-    """The number of each point's piece: pieces are connected cells of a grid."""
-    from scipy.ndimage import label
-    from scipy.spatial import KDTree
-
-    low = points.amin(0)
-    some = points[:: max(len(points) // 1000, 1)].double().numpy()
-    apart, _ = KDTree(points.double().numpy()).query(some, 2)
-    width = max(float((points - low).max()) / CELLS, SPACING * float(np.median(apart[:, 1]))) or 1.0
-    cell = ((points - low) / width).long()
-    occupied = np.zeros((CELLS + 2,) * 3, dtype=bool)
-    occupied[tuple(cell.T.numpy())] = True
-    labels: Any = label(occupied, np.ones((3, 3, 3)))
-    return torch.from_numpy(labels[0][tuple(cell.T.numpy())]).long()
