@@ -16,7 +16,7 @@ from distrace.fitting.ray_sampling import drawn
 from distrace.photos.colour_segmentation import ColourModel, appearance
 from distrace.photos.problem import MARCH, NEARBY, ComparisonConfig, PhotoProblem, PlacedShape, TracedShape
 from distrace.photos.stereo_pairs import GradientImage, neighbour_views, normalise_light
-from distrace.photos.visual_hull import Masks
+from distrace.photos.visual_hull import Masks, consistent_silhouettes
 from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Bounds, Rays, meet_sphere
@@ -24,6 +24,7 @@ from distrace.surface import normals
 from distrace.tracing.sphere_tracing import Trace, sphere_trace
 
 LEAST_COSINE = 0.2  # between a normal and the direction to another view that sees the point
+LEAST_CERTAINTY = 0.3  # below it a pixel's label is unknown
 NEAR_SURFACE = 0.1  # radii: background rays whose least value is larger are left out
 
 Labels = Sequence[Float[Tensor, "height width"]]
@@ -130,16 +131,23 @@ class PhotoSet:
 
     @torch.no_grad()
     def labels(self, sample: SampledRays) -> Labels:
-        """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses."""
+        """Labels of all pixels: by masks where there are some, otherwise by the appearance of hits and misses.
+
+        Pixels that look like the object where most other views rule it out are unknown.
+        """
         hit = sample.trace.hit
         seen = sample.read(self.appearances)
         outside = [looks[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
         background = torch.cat([seen[~hit], *outside])
         is_object = torch.cat([hit[hit], hit.new_zeros(len(background))])
         model = ColourModel.of(torch.cat([seen[hit], background]), is_object)
+        certainties = [2 * model.smooth_probability(looks) - 1 for looks in self.appearances]
+        silhouettes = consistent_silhouettes(self.cameras, [certainty > 0 for certainty in certainties])
         return [
-            2 * model.smooth_probability(looks) - 1 if photograph.mask is None else 2.0 * photograph.mask - 1
-            for photograph, looks in zip(self.photographs, self.appearances, strict=True)
+            certainty.masked_fill((certainty > 0) & ~silhouette | (certainty.abs() < LEAST_CERTAINTY), 0.0)
+            if photograph.mask is None
+            else 2.0 * photograph.mask - 1
+            for photograph, certainty, silhouette in zip(self.photographs, certainties, silhouettes, strict=True)
         ]
 
     def object_masks(self) -> Masks:
