@@ -73,7 +73,7 @@ def test_the_shape_of_another_code_is_found_in_a_few_iterations(decoder: Decoder
     assert done == list(range(1, CONFIG.total + 1))
     (losses,) = fit.losses.values()
     assert len(losses) == CONFIG.iterations
-    assert losses[-1] == fit.loss < losses[CONFIG.iterations // 2]
+    assert losses[-1] == fit.loss < losses[0] / 2
     assert fit.evaluations > 1000
     assert fit.seconds > 0
 

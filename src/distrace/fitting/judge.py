@@ -13,11 +13,11 @@ from distrace.pose import Similarity
 from distrace.rays import Bounds, meet_sphere
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
-NEAR = 0.03  # of the size: a point that near to the surface is explained by it
+NEAR = 0.03  # of the shape's radius: a point that near to the surface is explained by it
 BLOCKED = 0.03  # of the size: a shape that far before the end of a ray blocks it
 INSIDE = (0.005, 0.01, 0.02, 0.04)  # of the size: so far behind a point there is an inside
 MOST_RAYS = 600
-MOST_NOISE = 0.02  # of the size, that excuses a distance
+MOST_NOISE = 0.01  # of the shape's radius: twice so much noise is excused, besides
 SEEN = (0.65, 0.15)  # share of its length along each axis that was seen, of what is trusted, and of what has not failed
 SURFACE_POINTS = 500
 OUTER = (0.02, 0.98)  # quantiles between which points or a surface span
@@ -55,9 +55,11 @@ def judged(
     scan: Scan, sdf: SDF, place: Similarity, disagreement: float = 0.0, silhouette: float | None = None
 ) -> Verdict:
     """Returns the verdict on a placed shape. `disagreement` is that of the other ends: `disagreement_of`."""
-    near = (distances(scan.points, sdf, place, scan.noise) < NEAR) & _have_inside(place.to_object(scan.points), sdf)
-    explained = float(near.float().mean()) if len(near) else 1.0
     surface = surface_points(sdf, SURFACE_POINTS, scan.points)
+    reach = _reach(surface)
+    away = distances(scan.points, sdf, place) - 2 * min(scan.noise / float(place.scale), MOST_NOISE * reach)
+    near = (away < NEAR * reach) & _have_inside(place.to_object(scan.points), sdf)
+    explained = float(near.float().mean()) if len(near) else 1.0
     seen = _extent_seen(place.to_object(scan.points[near]), surface) if len(near) else 1.0
     blocked = _blocked_share(scan, sdf, place)
     reasons = []
@@ -104,13 +106,18 @@ def _extent_seen(points: Float[Tensor, "n 3"], surface: Float[Tensor, "m 3"]) ->
     return float((spanned / length.clamp_min(1e-6)).min().clamp(0, 1))
 
 
-def distances(points: Float[Tensor, "n 3"], sdf: SDF, place: Similarity, noise: float = 0.0) -> Float[Tensor, "n"]:
-    """How far points of the scan's frame are from the surface, in sizes, beyond twice the noise."""
+def _reach(surface: Float[Tensor, "m 3"]) -> float:
+    """Returns the radius of a surface about its middle: a shape may be much smaller than the unit sphere."""
+    if not len(surface):
+        return 1.0
+    return float((surface - surface.median(dim=0).values).norm(dim=-1).max())
+
+
+def distances(points: Float[Tensor, "n 3"], sdf: SDF, place: Similarity) -> Float[Tensor, "n"]:
+    """How far points of the scan's frame are from the surface, in radii of the unit sphere."""
     points = place.to_object(points)
     length = points.norm(dim=-1).clamp_min(1.0)
-    values = sdf(points / length[:, None]) + length - 1
-    excused = 2 * min(noise / float(place.scale), MOST_NOISE)
-    return (values.abs() - excused).clamp_min(0)
+    return (sdf(points / length[:, None]) + length - 1).abs()
 
 
 @torch.no_grad()

@@ -25,7 +25,7 @@ EFFECTIVE_POINTS = 200.0  # what all points count together, however many: errors
 EFFECTIVE_RAYS = 600.0  # the same, of rays
 FINE_SAMPLES = 4  # points about the least sample of a ray
 MARGIN = 0.7  # deviations that a free ray keeps from the surface
-POINT_DEPTH = 0.3  # deviations that points lie inside, so that a thin sheet has an inside
+POINT_DEPTH = 0.3  # deviations that points of a scan lie inside, so that a thin sheet has an inside
 
 
 @dataclass(frozen=True)
@@ -175,8 +175,9 @@ class ScanProblem:
         weights = values.new_full((len(values),), EFFECTIVE_POINTS / max(len(sample.points), 1))
         weights[len(sample.points) :] = EFFECTIVE_RAYS / max(len(sample.until), 1)
         off = values * factor
-        off[: len(sample.points)] += POINT_DEPTH
         off[len(sample.points) : len(sample.points) + free] -= MARGIN
+        if self.moves:
+            off[: len(sample.points)] += POINT_DEPTH
         if sample.distances is not None:
             count = len(sample.points)
             off[:count] -= sample.distances.clamp(-FAR, FAR) / self.deviation
