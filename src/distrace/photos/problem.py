@@ -23,7 +23,7 @@ from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
-NEARBY = 0.05  # radii: an iteration moves the surface less
+NEARBY = 0.03  # radii: an iteration moves the surface by about as much; occluders are farther from a point
 LEAST_SLOPE = 0.2  # of |∇f · v|: at grazing rays points slide farther than the linearisation holds
 OUTLINE_SATURATION = 3.0  # × the outline scale: beyond it a label is wrong rather than the shape
 PLACE_DEVIATIONS = (0.6, 0.6, 0.6, 0.2, 0.2, 0.2, 0.1)  # prior: rotation (radians), translation (radii), log scale
