@@ -101,7 +101,7 @@ def _outcome(task: Task, fit: CodeFit) -> Outcome:
     others: list[Tensor] = []
     evaluations = fit.evaluations
     if task.plausible:
-        config = CodeFitConfig(seed=task.fit.seed)
+        config = task.fit if isinstance(task.fit, CodeFitConfig) else CodeFitConfig(seed=task.fit.seed)
         others, spent = plausible(task.model, task.known, task.plausible, config)
         evaluations += spent
     mesh = task.surface(fit.code)

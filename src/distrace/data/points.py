@@ -15,6 +15,7 @@ MOST_POINTS = 20_000
 RADIUS_SHARE = 0.8  # of the points are surely the object's: they tell its radius, …
 RADIUS_FACTOR = 1.25  # … which is this × their largest distance from the median
 NEIGHBOURS = 16  # of a point, which tell the noise
+DENSE = 1000  # points: fewer lie so far apart that the shape's bends look like noise
 CELLS = 64  # along the object, at most: pieces of it touch in such cells, …
 SPACING = 3.0  # … which are at least so many distances of neighbouring points wide
 PIECE_SHARE = 0.2  # of the largest piece's points: so large a piece is another part of the object
@@ -33,17 +34,16 @@ def thinned(rows: Tensor, most: int = MOST_POINTS) -> Tensor:
 
 
 def noise_of(points: Float[Tensor, "n 3"]) -> float:
-    """The median distance of points from the plane through their neighbours."""
+    """The median distance (root mean square) of points' neighbours from a plane; 0 of sparse points."""
     from scipy.spatial import KDTree
 
-    if len(points) < NEIGHBOURS:
+    if len(points) < DENSE:
         return 0.0
-    count = NEIGHBOURS
     chosen = points[:: max(len(points) // 1000, 1)].double().numpy()
-    _, near = KDTree(points.double().numpy()).query(chosen, count)
+    _, near = KDTree(points.double().numpy()).query(chosen, NEIGHBOURS)
     around = points.double().numpy()[near]
     flatness = np.linalg.svd(around - around.mean(1, keepdims=True), compute_uv=False)[:, -1]
-    return float(np.median(flatness) / np.sqrt(count))
+    return float(np.median(flatness) / np.sqrt(NEIGHBOURS))
 
 
 def object_points(points: Float[Tensor, "n 3"], floor: "Floor | None", share: float = PIECE_SHARE) -> Bool[Tensor, "n"]:

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.observation import View
-from distrace.data.scan import canonical_scan
+from distrace.data.points import noise_of
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
 from distrace.fitting.ray_sampling import Targets, drawn, pools_of
@@ -22,7 +22,6 @@ from distrace.prior import START_DEVIATION, Prior
 from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
-TELLING = 1000  # depths of a view: fewer lie so far apart that the shape's bends look like noise
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
 
@@ -81,8 +80,7 @@ class Observed:
     def of_views(decoder: Decoder, views: Sequence[View], prior: Prior) -> "Observed":
         """Raises `ValueError` without views, or with one from inside the mean shape."""
         pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-        dense = [view.to("cpu") for view in views if int(view.seen.sum()) >= TELLING]
-        noise = max((canonical_scan(view).noise for view in dense), default=0.0)
+        noise = max(noise_of(view.to("cpu").points()) for view in views)
 
         def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
             return _sample([pool.draw(points, rays, random) for pool in pools], 2 * noise)

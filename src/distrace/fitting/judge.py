@@ -14,8 +14,8 @@ from distrace.rays import Bounds, meet_sphere
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
 
 NEAR = 0.03  # of the shape's radius: a point that near to the surface is explained by it
-BLOCKED = 0.03  # of the size: a shape that far before the end of a ray blocks it
-INSIDE = (0.005, 0.01, 0.02, 0.04)  # of the size: so far behind a point there is an inside
+BLOCKED = 0.03  # radii of the unit sphere: a shape that far before the end of a ray blocks it
+INSIDE = (0.005, 0.01, 0.02, 0.04)  # radii of the unit sphere: so far behind a point there is an inside
 MOST_RAYS = 600
 MOST_NOISE = 0.01  # of the shape's radius: twice so much noise is excused, besides
 SEEN = (0.65, 0.1)  # share of its length along each axis that was seen, of what is trusted, and of what has not failed
@@ -57,16 +57,17 @@ def judged(
     """Returns the verdict on a placed shape. `disagreement` is that of the other ends: `disagreement_of`."""
     surface = surface_points(sdf, SURFACE_POINTS, scan.points)
     reach = _reach(surface)
-    away = distances(scan.points, sdf, place) - 2 * min(scan.noise / float(place.scale), MOST_NOISE * reach)
+    noise = 2 * min(scan.noise / float(place.scale), MOST_NOISE * reach)
+    away = distances(scan.points, sdf, place) - noise
     near = (away < NEAR * reach) & _have_inside(place.to_object(scan.points), sdf)
     explained = float(near.float().mean()) if len(near) else 1.0
     seen = _extent_seen(place.to_object(scan.points[near]), surface) if len(near) else 1.0
-    blocked = _blocked_share(scan, sdf, place)
-    reasons = []
+    blocked = _blocked_share(scan, sdf, place, noise)
+    reasons = [] if len(near) else ["no point of the surface is known"]
     if explained < TRUSTED[0]:
         reasons.append(f"{1 - explained:.0%} of the points lie away from the surface")
     if blocked > TRUSTED[1]:
-        reasons.append(f"the shape blocks {blocked:.0%} of the rays that saw through it")
+        reasons.append(f"the shape blocks {blocked:.0%} of the rays of free space")
     if disagreement > TRUSTED[2]:
         reasons.append(f"another fit that is as good lies {disagreement:.0%} of the size away")
     if seen < SEEN[0]:
@@ -78,7 +79,7 @@ def judged(
     name = "failed" if failed else "doubtful" if reasons else "trusted"
     usual = f"{explained:.0%} of the points lie on the surface, and "
     if len(scan.free_until):
-        usual += f"it blocks {blocked:.0%} of the rays that saw through"
+        usual += f"it blocks {blocked:.0%} of the rays of free space"
     else:
         usual += "no free space is known"
     return Verdict(name, explained, blocked, seen, disagreement, silhouette, "; ".join(reasons) or usual)
@@ -146,11 +147,14 @@ def surface_points(sdf: SDF, count: int, like: Tensor, seed: int = 0) -> Float[T
     return points[(points.norm(dim=-1) < 1) & (sdf(points).abs() < 1e-2)][:count]
 
 
-def _blocked_share(scan: Scan, sdf: SDF, place: Similarity) -> float:
-    """Of the rays that pass the unit sphere before their end, the share that passes through the shape."""
+def _blocked_share(scan: Scan, sdf: SDF, place: Similarity, noise: float) -> float:
+    """Of the rays that pass the unit sphere before their end, the share that passes through the shape.
+
+    `noise`, in radii of the unit sphere, is that of their ends.
+    """
     rays = place.rays_in_object(scan.free)
     bounds = meet_sphere(rays)
-    far = bounds.far.minimum((scan.free_until - 2 * scan.noise) / place.scale - BLOCKED)
+    far = bounds.far.minimum(scan.free_until / place.scale - noise - BLOCKED)
     passing = bounds.near < far
     if not passing.any():
         return 0.0

@@ -133,22 +133,27 @@ class ScanProblem:
         t = near[..., None] + width[..., None] * steps
         least, where = field(origins[:, :, None] + t[..., None] * directions[:, :, None]).min(dim=2)
         t = t.gather(2, where[..., None])[..., 0]
-        self._refine(field, Rays(origins, directions), t, least, width, meets)
+        refined = self._refine(field, Rays(origins, directions), t, least, width, meets)
         is_free = torch.arange(count, device=t.device) < sample.free
         wrong = meets & torch.where(is_free, least * scale < MARGIN * self.deviation, least > 0)
         at = origins + t[..., None] * directions
-        for state in states:
-            self.evaluations[state.start] += count * self.samples
+        for state, more in zip(states, refined, strict=True):
+            self.evaluations[state.start] += count * self.samples + more
         free = (wrong & is_free).sum(1).tolist()
         return [(state.place.to_world(at[k, wrong[k]]), free[k]) for k, state in enumerate(states)]
 
     def _refine(
         self, field: BatchField, rays: Rays, t: Tensor, least: Tensor, width: Tensor, meets: Bool[Tensor, "starts n"]
-    ) -> None:
-        """Looks between the samples of rays on which something may be there; moves `t` and `least`."""
-        start, ray = (meets & (least.abs() < width)).nonzero(as_tuple=True)
+    ) -> list[int]:
+        """Looks between the samples of rays on which something may be there; moves `t` and `least`.
+
+        Returns the evaluations of each start.
+        """
+        is_near = meets & (least.abs() < width)
+        evaluations = (FINE_SAMPLES * is_near.sum(1)).tolist()
+        start, ray = is_near.nonzero(as_tuple=True)
         if not len(start):
-            return
+            return evaluations
         offsets = torch.linspace(-0.5, 0.5, FINE_SAMPLES).to(t) * (1 - 1 / FINE_SAMPLES)
         along = t[start, ray][None] + width[start, ray] * offsets[:, None]
         some = rays[start, ray]
@@ -157,6 +162,7 @@ class ScanProblem:
         start, ray = start[better], ray[better]
         t[start, ray] = along.gather(0, where[None])[0, better]
         least[start, ray] = values[better]
+        return evaluations
 
     def _residuals(self, state: PlacedCode, code: Tensor, wrong: tuple[Tensor, int]) -> Residuals:
         place = state.place
