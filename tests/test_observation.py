@@ -154,7 +154,7 @@ def test_a_file_of_another_kind_ends_in_one_sentence(tmp_path: Path, content: by
     path = tmp_path / "view.npz"
     if content is not None:
         path.write_bytes(content)
-    refused(path, "is not an observation")
+    refused(path, "is not an observation" if path.exists() else "does not exist")
 
 
 def test_a_folder_or_a_lone_array_is_no_observation(tmp_path: Path) -> None:
