@@ -57,9 +57,7 @@ class Complete:
     reference: Annotated[Path | None, default("none", "PLY")] = None
     """true surface in the input's frame, to measure against: a mesh or points"""
     strict: Flag = False  # exit status 3 where the verdict is `failed`
-    points: Annotated[int | None, default("all", "INT")] = (
-        None  # number of the object's points to use, at random
-    )
+    points: Annotated[int | None, default("all", "INT")] = None  # number of the object's points to use, at random
     seed: int = 0
     resolution: int = 128  # cells along each side of the mesh's grid; 256 keeps parts thinner than 1/64 whole
     device: str = "cpu"
@@ -106,9 +104,7 @@ class Complete:
         path = next(iter(self.inputs))
         cloud = path.suffix.lower() in CLOUDS
         if cloud and (self.solver == "adam" or self.ignore):
-            raise ValueError(
-                f"{path} is a cloud of points, which knows no --solver adam and no --ignore"
-            )
+            raise ValueError(f"{path} is a cloud of points, which knows no --solver adam and no --ignore")
         chosen = CodeFitConfig if self.solver == "lm" else FitConfig
         iterations = chosen.iterations if self.iterations is None else self.iterations
         starts = chosen.starts if self.starts is None else self.starts
