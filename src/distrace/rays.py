@@ -1,5 +1,6 @@
 """Rays, and the interval of each within the bounds of a field."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,6 +33,14 @@ class Rays(ByValue):
 
     def __getitem__(self, index: Tensor | tuple[Any, ...] | int) -> "Rays":
         return Rays(self.origins[index], self.directions[index])
+
+    @staticmethod
+    def cat(rays: Sequence["Rays"]) -> "Rays":
+        """Returns rays one after the other, along the first axis."""
+        return Rays(torch.cat([each.origins for each in rays]), torch.cat([each.directions for each in rays]))
+
+    def to(self, device: torch.device | str) -> "Rays":
+        return Rays(self.origins.to(device), self.directions.to(device))
 
     def flat(self) -> "Rays":
         return Rays(self.origins.reshape(-1, 3), self.directions.reshape(-1, 3))

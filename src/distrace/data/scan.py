@@ -58,8 +58,8 @@ class Scan:
         return replace(
             self,
             points=self.points.to(device),
-            free=Rays(self.free.origins.to(device), self.free.directions.to(device)),
-            hits=Rays(self.hits.origins.to(device), self.hits.directions.to(device)),
+            free=self.free.to(device),
+            hits=self.hits.to(device),
             free_until=self.free_until.to(device),
             ups=self.ups.to(device),
             views=views,
@@ -93,8 +93,8 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
 def joined(scans: Sequence[Scan]) -> Scan:
     """Returns several scans of one object in one frame as one."""
     points = torch.cat([scan.points for scan in scans])
-    free = _joined_rays([scan.free for scan in scans])
-    hits = _joined_rays([scan.hits for scan in scans])
+    free = Rays.cat([scan.free for scan in scans])
+    hits = Rays.cat([scan.hits for scan in scans])
     free_until = torch.cat([scan.free_until for scan in scans])
     noise = float(np.mean([scan.noise for scan in scans]))
     views = tuple(view for scan in scans for view in scan.views)
@@ -133,7 +133,7 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up,
     rays, until, hit_rays = _rays(scene.camera, depth, free & around, hits)
     if floor is not None:
         below = rays_below(floor, points[kept])
-        rays = _joined_rays([rays, below])
+        rays = Rays.cat([rays, below])
         until = torch.cat([until, torch.full((len(below.origins),), torch.inf)])
     return _scan(points[kept], rays, until, hit_rays, up, (view,))
 
@@ -231,10 +231,6 @@ def _scan(points: Tensor, free: Rays, free_until: Tensor, hits: Rays, up: Up, vi
     if not float((points - points[0]).norm(dim=-1).max()) > 0:
         raise ValueError(f"all of its {len(points)} points are in one place")
     return Scan(points, free, free_until, hits, noise_of(points), up.candidates, up.tilt, views)
-
-
-def _joined_rays(rays: Sequence[Rays]) -> Rays:
-    return Rays(torch.cat([each.origins for each in rays]), torch.cat([each.directions for each in rays]))
 
 
 def _check_count(count: int) -> None:

@@ -202,8 +202,7 @@ def _sample(targets: Sequence[Targets], before: float) -> ScanSample:
         free.append(rays[is_free])
         until.append(distance[is_free] - before)
         hits.append(rays[target.is_object & ~known])
-    every = [*free, *hits]
-    rays = Rays(torch.cat([each.origins for each in every]), torch.cat([each.directions for each in every]))
+    rays = Rays.cat([*free, *hits])
     ends = torch.cat(until)
     beyond = ends.new_full((len(rays.origins) - len(ends),), torch.inf)
     return ScanSample(torch.cat(points), rays, torch.cat([ends, beyond]), len(ends))

@@ -66,10 +66,8 @@ class ScanSample:
         chosen = drawn(scan.points, points, random)
         hits = torch.randperm(len(scan.hits.origins), generator=random)[: rays // 2]
         free = torch.randperm(len(scan.free_until), generator=random)[: rays - len(hits)]
-        origins = torch.cat([scan.free.origins[free], scan.hits.origins[hits]])
-        directions = torch.cat([scan.free.directions[free], scan.hits.directions[hits]])
         until = torch.cat([scan.free_until[free], scan.points.new_full((len(hits),), torch.inf)])
-        return ScanSample(chosen, Rays(origins, directions), until, len(free))
+        return ScanSample(chosen, Rays.cat([scan.free[free], scan.hits[hits]]), until, len(free))
 
 
 @dataclass

@@ -94,7 +94,7 @@ class PhotoSet:
             camera.rays(camera.pixels().flatten(0, 1)[pixels])
             for camera, pixels in zip(self.cameras, chosen, strict=True)
         ]
-        rays_world = Rays(torch.cat([part.origins for part in parts]), torch.cat([part.directions for part in parts]))
+        rays_world = Rays.cat(parts)
         rays_object = shape.place.rays_in_object(rays_world)
         sdf = Counted(self.decoder.field(self.prior.code(shape.w)))
         trace = sphere_trace(sdf, rays_object, meet_sphere(rays_object), MARCH)
