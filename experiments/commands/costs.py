@@ -73,7 +73,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class Memory:
-    """Measure the memory of one image beyond the weights, up to 4096 × 4096 pixels."""
+    """Measure the memory of one image beyond the weights, of 1024 × 1024 and 2048 × 2048 pixels."""
 
     model: Name = "sofas"
     out: Path = Path("out/memory")

@@ -20,7 +20,7 @@ from experiments.costs.counting import Operations, recorded
 from experiments.fields.untrained import ball
 
 BOTH = ("fast", "coarse_to_fine")
-MEASURED = (1024, 2048, 4096)  # pixels along each side, for which memory is measured
+MEASURED = (1024, 2048)  # pixels along each side, for which memory is measured
 SIZES = (64, 128, 256, 512, 1024, 2048)  # pixels along each side
 NETWORKS = ((4, 128), (4, 256), (8, 256), (8, 512))  # layers × width
 VIEWS = (1, 2, 4, 8, 16)
