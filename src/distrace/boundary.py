@@ -19,6 +19,7 @@ from distrace import surface
 from distrace.fields.base import SDF, at_rows, value_and_gradient
 from distrace.rays import Bounds, Rays
 from distrace.render import Buffers
+from distrace.vectors import length
 
 Colour = Callable[[Float[Tensor, "n 3"], Float[Tensor, "n 3"], Float[Tensor, "n 3"]], Float[Tensor, "n channels"]]
 """Maps points, unit normals and ray directions to colours."""
@@ -84,7 +85,12 @@ def _uses_normals(colour: Colour, points: Tensor, normals: Tensor, directions: T
     """Returns whether colours depend on normals, by those of the first hit."""
     normal = normals[:1].detach().requires_grad_()
     colours = colour(points[:1].detach(), normal, directions[:1].detach())
-    return colours.requires_grad and torch.autograd.grad(colours.sum(), normal, allow_unused=True)[0] is not None
+    return colours.requires_grad and _gradient(colours, normal) is not None
+
+
+def _gradient(values: Tensor, by: Tensor) -> Tensor | None:
+    """Returns the gradient of the sum of values; None where they do not depend on `by`."""
+    return torch.autograd.grad(values.sum(), by, allow_unused=True)[0]
 
 
 def _constant_normals(buffers: Buffers) -> bool:
@@ -93,9 +99,9 @@ def _constant_normals(buffers: Buffers) -> bool:
     points = buffers.points[::stride].detach().requires_grad_()
     field = at_rows(buffers.field_at(buffers.mask), torch.arange(len(buffers.points), device=points.device)[::stride])
     normals = surface.normals(field, points)
-    tangent = torch.linalg.cross(normals.detach(), normals.detach().roll(1, -1) + 0.1)
-    (turning,) = torch.autograd.grad((normals * tangent).sum(), points, allow_unused=True)
-    return turning is None or bool((turning.norm(dim=-1) < CONSTANT_NORMAL / buffers.radius).float().mean() > 0.5)
+    tangent = torch.cross(normals.detach(), normals.detach().roll(1, -1) + 0.1, dim=-1)
+    turning = _gradient(normals * tangent, points)
+    return turning is None or bool((length(turning) < CONSTANT_NORMAL / buffers.radius).float().mean() > 0.5)
 
 
 @dataclass(frozen=True)
@@ -144,7 +150,7 @@ def _jumps(buffers: Buffers, axis: int) -> _Pairs:
     other_axis = -3 - axis  # of the last two
     pairs = _Pairs(near, far, _neighbour(near, shape, other_axis), torch.ones_like(t[near]), t[near])
     before = rays[near].at(t[near]) - rays[far].at(t[far])
-    jumps = (before * normals[far]).sum(-1) > DEPTH_STEP * pairs.pixel_steps(rays)[0].norm(dim=-1)
+    jumps = (before * normals[far]).sum(-1) > DEPTH_STEP * length(pairs.pixel_steps(rays)[0])
     return pairs[jumps | t[far].isinf()]
 
 
@@ -162,7 +168,7 @@ def _crossed(buffers: Buffers, pairs: _Pairs) -> _Pairs:
     """
     rays = buffers.rays.detach().flat()
     t = buffers.trace.distance.reshape(-1)
-    pixel = pairs.pixel_steps(rays)[0].norm(dim=-1)
+    pixel = length(pairs.pixel_steps(rays)[0])
     reach = (0.1 * buffers.radius * pixel).sqrt()  # how far behind the near pixel's hit round shapes are touched
     for _ in range(NEWTON_STEPS):
         if not len(pairs.near):
@@ -190,7 +196,7 @@ def _change(buffers: Buffers, crossed: _Pairs, colour: Colour, image: Float[Tens
     rays = buffers.rays.flat()
     ray = crossed.rays(rays)
     steps = crossed.pixel_steps(rays.detach())
-    value, gradient, normal = _least(buffers.sdf, ray, crossed.distance, SIDE_OFFSET * steps[0].norm(dim=-1))
+    value, gradient, normal = _least(buffers.sdf, ray, crossed.distance, SIDE_OFFSET * length(steps[0]))
     along, across = ((gradient * step).sum(-1) for step in steps)
     motion = -(value - value.detach()) * along**3 / (along**4 + across**4).clamp_min(1e-30)
     with torch.no_grad():

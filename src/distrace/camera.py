@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 
 from distrace.equality import ByValue
 from distrace.rays import Rays
+from distrace.vectors import length, numbers
 from distrace.viewpoint import Number, Point, orbiting, together, upright
 
 
@@ -71,11 +72,11 @@ class Camera(ByValue):
         eye, target = together(eye, target)
         forward = target - eye
         if not torch.isfinite(forward).all():
-            raise ValueError(f"a camera at {eye.tolist()}, looking at {target.tolist()}, is not finite")
-        if not (forward.norm(dim=-1) > 0).all():
-            raise ValueError(f"the camera at {eye.tolist()} looks at its own place; move the eye or the target")
+            raise ValueError(f"a camera at {numbers(eye)}, looking at {numbers(target)}, is not finite")
+        if not (length(forward) > 0).all():
+            raise ValueError(f"the camera at {numbers(eye)} looks at its own place; move the eye or the target")
         pose = torch.eye(4, dtype=eye.dtype, device=eye.device).repeat(*eye.shape[:-1], 1, 1)
-        pose[..., :3, :3] = upright(forward / forward.norm(dim=-1, keepdim=True))
+        pose[..., :3, :3] = upright(forward / length(forward)[..., None])
         pose[..., :3, 3] = eye
         middle = pose.new_tensor([[1.0, 0.0, width / 2], [0.0, 1.0, height / 2], [0.0, 0.0, 1.0]])
         intrinsics = middle.repeat(*eye.shape[:-1], 1, 1)
@@ -135,7 +136,7 @@ class Camera(ByValue):
         axes = (1,) * (pixels.dim() - 1)
         rotation = self.T_world_camera[..., :3, :3].reshape(*batch, *axes, 3, 3)
         ahead = self._ahead(pixels)
-        depth_one = ahead.norm(dim=-1)
+        depth_one = length(ahead)
         directions = (rotation * (ahead / depth_one[..., None])[..., None, :]).sum(-1)
         origins = self.T_world_camera[..., :3, 3].reshape(*batch, *axes, 3).expand_as(directions)
         focal = self.intrinsics[..., 0, 0].reshape(*batch, *axes)
@@ -161,7 +162,7 @@ class Camera(ByValue):
 
     def cosines(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
         """Returns the cosine between each pixel's ray and the optical axis: depth over distance."""
-        return 1 / self._ahead(self.pixels() if pixels is None else pixels).norm(dim=-1)
+        return 1 / length(self._ahead(self.pixels() if pixels is None else pixels))
 
     def pixel_angle(self, pixels: Float[Tensor, "*pixels 2"] | None = None) -> Float[Tensor, "*batch_pixels"]:
         """Returns the width of a pixel at a distance of 1: cos²θ / f, θ from the optical axis, f in pixels."""
@@ -220,7 +221,7 @@ class Camera(ByValue):
     def _ahead(self, pixels: Tensor) -> Float[Tensor, "*batch_pixels 3"]:
         """Returns the points of pixels at depth 1, in the camera's axes."""
         axes = (1,) * (pixels.dim() - 1)
-        inverse = torch.linalg.inv(self.intrinsics).reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
+        inverse = self.intrinsics.inverse().reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
         return (inverse * pad(pixels, (0, 1), value=1.0)[..., None, :]).sum(-1)
 
 
@@ -235,17 +236,17 @@ def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:
     for name, matrix in (("intrinsics", intrinsics), ("T_world_camera", T_world_camera)):
         last = matrix.detach()[..., -1, :]
         if not torch.allclose(last, torch.eye(matrix.shape[-1], dtype=last.dtype, device=last.device)[-1]):
-            raise ValueError(f"the last row of {name} is {last.tolist()}, not 0 … 0 1; is the matrix transposed?")
+            raise ValueError(f"the last row of {name} is {numbers(last)}, not 0 … 0 1; is the matrix transposed?")
     focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
     if not (focal > 0).all():
-        raise ValueError(f"focal lengths of {focal.tolist()} pixels were given; they must be positive")
-    if not (torch.linalg.det(intrinsics.detach()).abs() > 1e-6 * focal.prod(-1)).all():
-        raise ValueError(f"the intrinsics {intrinsics.tolist()} have no inverse; they map camera axes to pixels")
+        raise ValueError(f"focal lengths of {numbers(focal)} pixels were given; they must be positive")
+    if not (intrinsics.detach().det().abs() > 1e-6 * focal.prod(-1)).all():
+        raise ValueError(f"the intrinsics {numbers(intrinsics)} have no inverse; they map camera axes to pixels")
     rotation = T_world_camera.detach()[..., :3, :3].double()
     error = (
         (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
     )
-    if error > 1e-3 or (torch.linalg.det(rotation) < 0).any():
+    if error > 1e-3 or (rotation.det() < 0).any():
         raise ValueError(
             f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right,"
             " y down, z forward) to the world, without scale or mirroring"

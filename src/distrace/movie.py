@@ -3,7 +3,6 @@
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -33,7 +32,7 @@ def turntable(camera: Camera, frames: int) -> list[Camera]:
 
 
 def filmed(
-    sdf: SDF | BatchField[Any], cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
+    sdf: SDF | BatchField, cameras: Iterable[Camera], *, radius: float = 1.0, config: Config = TracerConfig()
 ) -> Iterator[Buffers]:
     """Renders a field as each camera sees it. All use the occupancy that the first image measures.
 

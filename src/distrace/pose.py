@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from typing import cast
 
 import roma
 import torch
@@ -13,6 +12,7 @@ from torch.nn.functional import pad
 from distrace.camera import Camera
 from distrace.equality import ByValue
 from distrace.rays import Rays
+from distrace.vectors import length
 
 
 def exp_se3(
@@ -32,7 +32,7 @@ def exp_se3(
     zero = torch.zeros_like(x)
     rotation = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(*x.shape, 3, 3)
     generator = torch.cat([rotation, translation[..., None]], dim=-1)
-    return torch.linalg.matrix_exp(pad(generator, (0, 0, 0, 1)))
+    return pad(generator, (0, 0, 0, 1)).matrix_exp()
 
 
 def object_in_camera(camera: Camera) -> tuple[Float[Tensor, "3 3"], Float[Tensor, "3"]]:
@@ -70,14 +70,14 @@ def zoomed(camera: Camera, log_factor: Tensor) -> Camera:
 def aimed(camera: Camera, pixel: Float[Tensor, "2"]) -> Camera:
     """Returns the camera rotated in its place so that the world's origin lies on a pixel's ray, ahead of it."""
     rotation, translation = object_in_camera(camera)
-    ahead = torch.linalg.inv(camera.intrinsics) @ torch.cat([pixel, torch.ones_like(pixel[:1])])
-    towards_pixel = ahead / ahead.norm()
-    towards_origin = translation / translation.norm().clamp_min(1e-6)
-    axis = torch.linalg.cross(towards_origin, towards_pixel)
-    if not axis.norm() > 1e-6:  # straight behind: any axis across serves
-        axis = torch.linalg.cross(towards_origin, towards_origin.roll(1) + 0.1)
+    ahead = camera.intrinsics.inverse() @ torch.cat([pixel, torch.ones_like(pixel[:1])])
+    towards_pixel = ahead / length(ahead)
+    towards_origin = translation / length(translation).clamp_min(1e-6)
+    axis = torch.cross(towards_origin, towards_pixel, dim=-1)
+    if not length(axis) > 1e-6:  # straight behind: any axis across serves
+        axis = torch.cross(towards_origin, towards_origin.roll(1) + 0.1, dim=-1)
     angle = torch.acos((towards_origin @ towards_pixel).clamp(-1, 1))
-    turn = roma.rotvec_to_rotmat(axis / axis.norm() * angle)
+    turn = roma.rotvec_to_rotmat(axis / length(axis) * angle)
     return with_object_at(camera, turn @ rotation, turn @ translation)
 
 
@@ -91,13 +91,13 @@ def pose_error(camera: Camera, truth: Camera) -> tuple[float, float]:
     rotation, translation = object_in_camera(camera)
     true_rotation, true_translation = object_in_camera(truth)
     degrees = math.degrees(float(roma.rotmat_geodesic_distance(rotation.double(), true_rotation.double())))
-    return degrees, 100 * float((translation - true_translation).norm() / true_translation.norm())
+    return degrees, 100 * float(length(translation - true_translation) / length(true_translation))
 
 
 def _rotated(rotation: Float[Tensor, "3 3"], rotation_vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
     """Returns a rotation followed by another one, orthogonal to rounding also after many calls."""
     product = roma.rotvec_to_rotmat(rotation_vector) @ rotation
-    return cast(Tensor, roma.special_procrustes(product))
+    return roma.special_procrustes(product)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -160,7 +160,7 @@ class Similarity(ByValue):
 
     def step_from(self, other: "Similarity") -> Float[Tensor, "7"]:
         """Returns the step by which `other.moved(step)` is this placement."""
-        turn = cast(Tensor, roma.rotmat_to_rotvec(self.rotation @ other.rotation.T))
+        turn = roma.rotmat_to_rotvec(self.rotation @ other.rotation.T)
         return torch.cat([turn, self.translation - other.translation, (self.scale / other.scale).log()[None]])
 
     def change(self, points_object: Float[Tensor, "n 3"], gradient: Float[Tensor, "n 3"]) -> Float[Tensor, "n 7"]:
@@ -169,6 +169,6 @@ class Similarity(ByValue):
         `gradient` is that of the field at the points. In the object's frame the points move the other way:
         x → x − (ω × x + τ / scale + σ x).
         """
-        by_rotation = torch.linalg.cross(points_object, gradient) @ self.rotation.T
+        by_rotation = torch.cross(points_object, gradient, dim=-1) @ self.rotation.T
         by_scale = (points_object * gradient).sum(-1, keepdim=True)
         return -torch.cat([by_rotation, self.turned(gradient) / self.scale, by_scale], dim=1)

@@ -2,10 +2,7 @@
 
 import math
 import warnings
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import wraps
-from typing import Any, cast
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -18,6 +15,7 @@ from distrace.equality import ByValue, summary
 from distrace.errors import DoubtfulResult
 from distrace.fields.base import SDF, check_field
 from distrace.fields.batch import BatchField
+from distrace.image_cache import Images, cached
 from distrace.rays import Rays, meet_sphere
 from distrace.tracing import coarse_to_fine as pyramid
 from distrace.tracing.bounds import Occupancy
@@ -31,48 +29,7 @@ CLEARANCE_REACH = 0.02  # of the radius: the first step of the search for a ray'
 DOUBTFUL_SHARE = 1e-3  # of the rays: more without an answer are worth a warning
 
 Config = TraceConfig | TracerConfig
-Image = Callable[["Buffers"], Tensor]
-"""Computes one image of a rendering."""
 STRATEGIES: dict[str, Config] = {**MARCHES, "fast": TracerConfig()}
-
-
-class _Shared(torch.autograd.Function):
-    """The identity, for an image that other images use; it explains why a second backward pass fails."""
-
-    @classmethod
-    def attached(cls, image: Tensor) -> Tensor:
-        """Returns the image with this function in its graph."""
-        return cast(Tensor, cls.apply(image))
-
-    @staticmethod
-    def forward(ctx: Any, image: Tensor) -> Tensor:
-        ctx.save_for_backward(image.new_empty(0))
-        return image.view_as(image)
-
-    @staticmethod
-    def backward(ctx: Any, gradient: Tensor) -> Tensor:
-        try:
-            ctx.saved_tensors  # noqa: B018 – PyTorch raises where a backward pass has freed the graph
-        except RuntimeError as error:
-            raise RuntimeError(
-                "the images of one rendering share a graph, which a backward pass has freed; add up the losses and"
-                " call backward once, or pass retain_graph=True to every backward but the last"
-            ) from error
-        return gradient
-
-
-def _cached(compute: Image) -> Image:
-    """Computes an image on first use: once with its gradients, and once without where grad mode is off."""
-
-    @wraps(compute)
-    def read(buffers: "Buffers") -> Tensor:
-        key = (compute.__name__, torch.is_grad_enabled())
-        if key not in buffers.images:
-            image = compute(buffers)
-            buffers.images[key] = _Shared.attached(image) if image.requires_grad else image
-        return buffers.images[key]
-
-    return read
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,14 +40,14 @@ class Buffers(ByValue):
     `[*batch, height, width]` of the camera; lengths are in the units of the world.
     """
 
-    sdf: SDF | BatchField[Any]  # of one shape, or of the shape of each camera
+    sdf: SDF | BatchField  # of one shape, or of the shape of each camera
     rays: Rays
     cosines: Float[Tensor, "*batch"]  # depth over distance
     trace: Trace
     radius: float
     occupancy: Occupancy | None = None  # the default tracer's, for other views of the same field
     pixel: Float[Tensor, "*batch"] | None = None  # the width that a pixel covers at a distance of 1
-    images: dict[tuple[str, bool], Tensor] = field(default_factory=dict, init=False, compare=False)  # computed so far
+    images: Images = field(default_factory=Images, init=False, compare=False)
 
     def __repr__(self) -> str:
         hits = f"{int(self.mask.sum()):,} of {self.mask.numel():,} rays hit"
@@ -107,7 +64,7 @@ class Buffers(ByValue):
         return self.sdf.select(self._shapes(chosen))
 
     @property
-    @_cached
+    @cached
     def distance(self) -> Float[Tensor, "*batch"]:
         """Distance along the ray; `inf` where nothing was hit."""
         hit = self.trace.hit
@@ -117,7 +74,7 @@ class Buffers(ByValue):
         return self.trace.distance.masked_scatter(hit, attached)
 
     @property
-    @_cached
+    @cached
     def depth(self) -> Float[Tensor, "*batch"]:
         """Depth z along the optical axis; `inf` where nothing was hit."""
         missed = ~self.trace.hit
@@ -125,21 +82,21 @@ class Buffers(ByValue):
         return (along * self.cosines).masked_fill(missed, torch.inf)
 
     @property
-    @_cached
+    @cached
     def points(self) -> Float[Tensor, "hits 3"]:
         """The points that the rays of the mask hit, in the world."""
         hit = self.trace.hit
         return self.rays[hit].at(self.distance[hit])
 
     @property
-    @_cached
+    @cached
     def normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals in world axes, zero where nothing was hit. One gradient of the field per hit."""
         normals = surface.normals(self.field_at(self.mask), self.points)
         return torch.zeros_like(self.rays.directions).masked_scatter(self.mask[..., None], normals)
 
     @property
-    @_cached
+    @cached
     def footprint_widths(self) -> Float[Tensor, "hits"]:
         """Diameters of the balls of footprint normals: FOOTPRINT pixels, at most WIDEST of the radius."""
         hit = self.trace.hit
@@ -148,7 +105,7 @@ class Buffers(ByValue):
         return widest if self.pixel is None else widest.minimum(FOOTPRINT * distance * self.pixel.expand_as(hit)[hit])
 
     @property
-    @_cached
+    @cached
     def footprint_normal(self) -> Float[Tensor, "*batch 3"]:
         """Unit normals averaged over FOOTPRINT pixels, in world axes, zero where nothing was hit.
 
@@ -159,7 +116,7 @@ class Buffers(ByValue):
         return torch.zeros_like(self.rays.directions).masked_scatter(self.mask[..., None], normals)
 
     @property
-    @_cached
+    @cached
     def clearance(self) -> Float[Tensor, "*batch"]:
         """The least value of the field on each ray that misses, and its value at hits; `inf` outside of the bounds.
 
@@ -203,7 +160,7 @@ class Buffers(ByValue):
 
 
 def render(
-    sdf: SDF | BatchField[Any],
+    sdf: SDF | BatchField,
     camera: Camera,
     *,
     radius: float = 1.0,
@@ -258,9 +215,8 @@ def _marched(sdf: SDF, camera: Camera, rays: Rays, radius: float, config: TraceC
 
 def _warn(trace: Trace) -> None:
     """Warns of a picture that may be wrong."""
-    counts = torch.bincount(trace.outcome.reshape(-1), minlength=len(Outcome)).tolist()
-    exhausted = counts[Outcome.EXHAUSTED]
-    inside = counts[Outcome.INSIDE]
+    exhausted = int((trace.outcome == Outcome.EXHAUSTED).sum())
+    inside = int((trace.outcome == Outcome.INSIDE).sum())
     if not exhausted and not inside:
         return
     met = int(torch.isfinite(trace.closest).sum())

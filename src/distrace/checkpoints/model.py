@@ -8,7 +8,6 @@ import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from difflib import get_close_matches
-from importlib.resources import files
 from pathlib import Path
 from typing import overload
 
@@ -26,7 +25,7 @@ from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
 from distrace.files import written
 
-BUNDLED = Path(str(files("distrace"))) / "models"
+BUNDLED = Path(__file__).parents[1] / "models"
 VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
 
 
@@ -46,9 +45,9 @@ class Model(ByValue):
     def field(self, code: int) -> ShapeField: ...
 
     @overload
-    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField[ShapeField]: ...
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> ShapeField | BatchField: ...
 
-    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField[ShapeField]:
+    def field(self, code: int | Float[Tensor | np.ndarray, "*shapes length"]) -> SDF | BatchField:
         """Returns the signed distance field of a training code, of any code, or of B shapes from codes [B, length].
 
         Raises `ValueError` for a number or a length that the model has not.

@@ -1,7 +1,6 @@
 """The signed distance fields of several shapes, evaluated together."""
 
 from collections.abc import Callable, Iterator
-from typing import Generic, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -10,12 +9,11 @@ from torch import Tensor
 from distrace.equality import summary
 from distrace.fields.base import SDF, flattened
 
-Single = TypeVar("Single", bound=SDF)
 Evaluate = Callable[[Float[Tensor, "n 3"], Int[Tensor, "n"]], Float[Tensor, "n"]]
 """From points, and the number of each point's shape, to values."""
 
 
-class BatchField(Generic[Single]):
+class BatchField:
     """The fields of B shapes: the points of all of them go through the network in one product a layer.
 
     `field(points)` takes points [B, ..., 3], a set for each shape, and returns values [B, ...]. `field[b]` is the field
@@ -26,7 +24,7 @@ class BatchField(Generic[Single]):
         self,
         codes: Float[Tensor, "shapes length"],
         evaluate: Evaluate,
-        single: Callable[[Float[Tensor, "length"]], Single],
+        single: Callable[[Float[Tensor, "length"]], SDF],
     ) -> None:
         """`single` makes one shape's field from its code."""
         self.codes = codes
@@ -39,10 +37,10 @@ class BatchField(Generic[Single]):
     def __len__(self) -> int:
         return len(self.codes)
 
-    def __getitem__(self, shape: int) -> Single:
+    def __getitem__(self, shape: int) -> SDF:
         return self.single(self.codes[shape])
 
-    def __iter__(self) -> Iterator[Single]:
+    def __iter__(self) -> Iterator[SDF]:
         return map(self.single, self.codes)
 
     def __call__(self, points: Float[Tensor, "shapes *batch 3"]) -> Float[Tensor, "shapes *batch"]:
@@ -94,10 +92,10 @@ class Selection:
         return Selection(self.values, self.shape[rows])
 
 
-class CountedBatch(BatchField[Single]):
+class CountedBatch(BatchField):
     """The same fields; counts the points at which each shape is evaluated in a batch."""
 
-    def __init__(self, field: BatchField[Single]) -> None:
+    def __init__(self, field: BatchField) -> None:
         super().__init__(field.codes, field.evaluate, field.single)
         self.evaluations = [0] * len(field)
 

@@ -97,7 +97,7 @@ class Decoder(nn.Module):
         """
         return self._run(self.folded(code), points)
 
-    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField[ShapeField]":
+    def field(self, code: Float[Tensor | np.ndarray, "*shapes length"]) -> "ShapeField | BatchField":
         """Returns the signed distance field of one shape or, from codes [B, length], the field of B shapes.
 
         The code is folded into the biases of the layers that it enters, and keeps its gradient. The field has the
@@ -106,7 +106,7 @@ class Decoder(nn.Module):
         code = self.checked(code)
         return self.fields(code) if code.dim() == 2 else self._single(code)
 
-    def fields(self, codes: Float[Tensor | np.ndarray, "shapes length"]) -> "BatchField[ShapeField]":
+    def fields(self, codes: Float[Tensor | np.ndarray, "shapes length"]) -> BatchField:
         """Returns the field of several shapes."""
         codes = self.checked(codes)
         return BatchField(codes, Evaluation(self, self.folded(codes)), self._single)

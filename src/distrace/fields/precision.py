@@ -31,14 +31,14 @@ class BFloat16Decoder:
         with torch.autocast(points.device.type, torch.bfloat16):
             return self.decoder(points, code).float()
 
-    def field(self, code: Float[Tensor, "*shapes length"]) -> SDF | BatchField[SDF]:
+    def field(self, code: Float[Tensor, "*shapes length"]) -> SDF | BatchField:
         """Returns the field of one shape or, from codes [B, length], of B shapes; without derivatives.
 
         Raises `ValueError` for a code of another length.
         """
         return self.fields(code) if code.dim() == 2 else self._single(code)
 
-    def fields(self, codes: Float[Tensor, "shapes length"]) -> BatchField[SDF]:
+    def fields(self, codes: Float[Tensor, "shapes length"]) -> BatchField:
         """Returns the field of several shapes."""
         layers = self.layers(codes)
 
