@@ -7,7 +7,7 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("threads", "optional", "errors", "files", "processes", "equality", "image_cache", "pixels", "vectors"),
+    *("threads", "imports", "optional", "errors", "files", "processes", "equality", "image_cache", "pixels", "vectors"),
     *("rays", "viewpoint", "camera", "pose"),
     *("fields", "checkpoints", "prior"),
     *("tracing", "surface", "render", "boundary", "shading", "movie", "checking"),

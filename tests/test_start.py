@@ -41,6 +41,22 @@ def loaded(program: str) -> list[str]:
     return done.stdout.splitlines()[-1].split()
 
 
+@pytest.mark.parametrize("first", ["", "gc.disable()"])
+def test_public_names_are_imported_without_garbage_collection(first: str) -> None:
+    program = f"""
+import gc
+{first}
+before = gc.isenabled()
+passes = []
+gc.callbacks.append(lambda phase, details: passes.append(details["generation"]))
+import distrace
+distrace.Camera
+gc.callbacks.clear()
+print(before == gc.isenabled(), 2 in passes)
+"""
+    assert python("-c", program).stdout.strip() == "True False"
+
+
 @pytest.fixture(scope="module")
 def modules() -> list[str]:
     """The modules that all public names and all commands load."""

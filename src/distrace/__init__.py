@@ -9,12 +9,12 @@
 """
 
 import sys
-from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from distrace import threads as threads
+from distrace.imports import quickly
 
 if TYPE_CHECKING:
     from distrace.public import *  # noqa: F403
@@ -33,19 +33,19 @@ class _Package(ModuleType):
 def __getattr__(name: str) -> Any:
     """Imports a public name, or a module, when it is used: the command line starts without torch."""
     if name == "__all__":
-        return import_module("distrace.public").__all__
+        return quickly("distrace.public").__all__
     if not name.startswith("_"):
         if name != "render" and find_spec(f"distrace.{name}"):
-            return import_module(f"distrace.{name}")
+            return quickly(f"distrace.{name}")
         if name in __dir__():
-            value = getattr(import_module("distrace.public"), name)
+            value = getattr(quickly("distrace.public"), name)
             globals()[name] = value  # later uses find it without a search for a module of that name
             return value
     raise AttributeError(f"module 'distrace' has no attribute {name!r}")
 
 
 def __dir__() -> list[str]:
-    return import_module("distrace.public").__all__
+    return quickly("distrace.public").__all__
 
 
 sys.modules[__name__].__class__ = _Package

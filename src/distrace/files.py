@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from filelock import FileLock, Timeout
 from torch import Tensor
 
 
@@ -36,6 +35,8 @@ def written(path: str | Path) -> Generator[BinaryIO, None, None]:
 @contextmanager
 def alone(folder: str | Path) -> Generator[None, None, None]:
     """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
+    from filelock import FileLock, Timeout
+
     try:
         lock = FileLock(Path(folder) / ".lock").acquire(blocking=False)
     except Timeout:

@@ -8,11 +8,11 @@ import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr
 from dataclasses import dataclass, make_dataclass
-from importlib import import_module
 from threading import current_thread, main_thread
 from typing import Any
 
 import distrace
+from distrace.imports import quickly
 from distrace.optional import MissingLibrary
 
 
@@ -26,7 +26,7 @@ class Lazy:
 
     def loaded(self) -> type:
         """Returns the command."""
-        return getattr(import_module(self.module), self.name)
+        return getattr(quickly(self.module), self.name)
 
     def listed(self) -> type:
         """Returns a command without options, for the list of commands."""
