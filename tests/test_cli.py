@@ -1,6 +1,7 @@
 """The command line: the files and keys that other people's scripts rely on, and one line for whatever goes wrong."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -19,7 +20,7 @@ import distrace.cli.train_samples
 import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
-from distrace.cli import show
+from distrace.cli import COMMANDS, parsed, show
 from distrace.cli.console import progress
 from distrace.data.observation import View, load_view, save_view
 from distrace.data.samples import write_samples
@@ -428,13 +429,29 @@ def place(tmp_path: Path, model: Path, observation: Path) -> dict[str, str]:
         trimesh.Trimesh(points, [[0, 1, 2]], process=False).export(tmp_path / f"{name}.ply")
     np.save(tmp_path / "nan.npy", np.full(4, np.nan, dtype=np.float32))
     save_view(tmp_path / "silhouette.npz", load_view(observation).without("depth"))
-    out, silhouette = str(tmp_path / "out"), str(tmp_path / "silhouette.npz")
-    view = {"view": str(observation), "silhouette": silhouette}
+    save_view(tmp_path / "empty.npz", nothing_seen())
+    view = {"view": str(observation), **{name: str(tmp_path / f"{name}.npz") for name in ("silhouette", "empty")}}
+    out = str(tmp_path / "out")
     return {"tmp": str(tmp_path), "model": str(model), "out": out, **view}
 
 
+def nothing_seen() -> View:
+    """The view that `render` writes where no ray hits."""
+    camera = Camera.orbit(0, 0, 4, height=8, width=8)
+    return View(camera, torch.full((8, 8), torch.inf), torch.zeros(8, 8, dtype=torch.bool), torch.zeros(8, 8, 3))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_shows_what_each_option_defaults_to(name: str, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit):
+        parsed([name, "--help"])
+    text = " ".join(re.sub(r"[\u2500-\u257f]", " ", capsys.readouterr().out).split())
+    assert text.startswith(f"usage: distrace {name}")
+    assert re.search(r"\(default:[ ,'\"]*\)", text) is None
+
+
 BAD = [
-    ("", "Missing subcommand Expected"),
+    ("", "distrace: Expected one of {demo, render"),
     ("paint", "paint"),
     ("render", "MODEL"),
     ("render {tmp}/missing", "neither a folder nor a bundled model"),
@@ -442,7 +459,7 @@ BAD = [
     ("render {tmp}/nothing", "no specs.json"),
     ("render {tmp}/damaged", "not a DeepSDF specification"),
     ("render {model} --colour red", "--colour"),
-    ("render {model} --size many", "--size"),
+    ("render {model} --size many", "'many'; expected --size INT pixels along each side (default: 512); see distrace"),
     ("render {model} --out {tmp}/text", "text is a file; give another to write to"),
     ("render {model} --out {tmp}/text/below", "text is a file; give another to write to"),
     ("render {model} --code 2", "code 2 was asked for; spheres has 2"),
@@ -490,9 +507,11 @@ BAD = [
     ("complete {model} {view} --starts 0", "0 starts"),
     ("complete {model} {view} --reference {tmp}/text", "no mesh and no cloud"),
     ("complete {model} {view} --reference {tmp}/missing.ply", "does not exist"),
-    ("complete {model} {view} --ignore depth", "--ignore"),
+    ("complete {model} {view} --ignore depth", "distrace: Invalid choice 'depth' for argument '--ignore'"),
+    ("complete {model} {view} --frame world", "Expected one of ("),
+    ("complete {model} {view} --box 1 2 3", "Error parsing --box: another value was given; expected --box LEFT TOP"),
     ("complete {model} {view} --seed -1", "--seed -1 was given; a number from 0"),
-    ("complete {model} {silhouette} --ignore mask", "without its mask has no depth and no mask"),
+    ("complete {model} {silhouette} --ignore mask", "silhouette.npz: without its mask it shows nothing"),
     ("complete {model} {view} --reference {tmp}/nan.ply", "nan.ply is no mesh and no cloud of points"),
     ("complete {model} {view} --reference {tmp}/flat.ply", "its faces have no area"),
     ("complete {tmp}/missing {view}", "neither a folder nor a bundled model"),
@@ -501,7 +520,10 @@ BAD = [
     ("pose {model} {tmp}/empty", "empty is not an observation"),
     ("pose {model} {view} --code 7", "code 7 was asked for"),
     ("pose {model} {view} --code {tmp}/text", "neither the number of a training shape nor a code.npy"),
-    ("pose {model} {view} --ignore depth mask", "shows nothing of the object"),
+    ("pose {model} {view} --ignore depth mask", "view.npz: without its depth and mask it shows nothing"),
+    ("pose {model} {empty}", "empty.npz: it shows nothing"),
+    ("pose {model} {empty} --ignore normal", "empty.npz: without its normal it shows nothing"),
+    ("complete {model} {empty} --ignore normal", "empty.npz: without its normal it shows nothing"),
     ("pose {model} {view} --starts 0", "0 starts"),
     ("pose {model} {view} --azimuth 0 --distance 0", "its own place"),
     ("pose {model} {view} --elevation 5", "--elevation 5.0 --distance None were given without --azimuth"),

@@ -160,9 +160,14 @@ def _out_of_memory(error: Exception) -> bool:
 
 
 def _one_line(box: str) -> str:
-    """The parser's message without the box that it draws around it."""
-    words = re.sub(r"\x1b\[[0-9;]*m|[\u2500-\u257f]|-{4,}", " ", box).split()
-    return " ".join(words).removeprefix("Parsing error ").removeprefix("Unrecognized options ")
+    """The parser's message without the box that it draws around it, and without its title, which the rest repeats."""
+    title, _, content = box.strip().partition("\n")
+    text = re.sub(r"\x1b\[[0-9;]*m|[\u2500-\u257f]|-{4,}", " ", content or title)
+    text = " ".join(text.split()).replace("invalid choice", "Invalid choice", 1)
+    text = re.sub(r"no type matching .*(?= Argument helptext)", "another value was given", text)  # than lists of types
+    text = re.sub(r"'None', |, 'None'", "", text)  # of an option that is left out
+    text = text.replace(" Argument helptext:", "; expected").replace(" Available subcommands:", "; expected one of")
+    return re.sub(r"[ .]*For full helptext, (run|see):?", "; see", text)
 
 
 def _end(program: str, sentence: str, status: int) -> None:

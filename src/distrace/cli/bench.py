@@ -36,9 +36,12 @@ class Bench:
     what: tyro.conf.Positional[Literal["trace", "views", "gradients"]]
     """trace: every strategy on one view; views: the default tracer on random views; gradients: derivatives against
     finite differences, and the time of a backward pass"""
-    models: Annotated[tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]"), tyro.conf.Positional] = ()
-    """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, by default all
-    bundled models"""
+    models: tyro.conf.Positional[
+        Annotated[
+            tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]", help_behavior_hint="(default of `views`: all bundled)")
+        ]
+    ] = ()
+    """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, the others one"""
     out: Path = Path("out/bench")
     code: int = 0  # number of the training shape
     size: int = 512  # pixels along each side, for `trace` and the times of `gradients`

@@ -40,6 +40,9 @@ def default(value: object, metavar: str | None = None) -> Any:
     return tyro.conf.arg(metavar=metavar or type(value).__name__.upper(), help_behavior_hint=f"(default: {value})")
 
 
+NONE = tyro.conf.arg(help_behavior_hint="(default: none)")  # of options that take any number of values
+
+
 class Every:
     """A timer that says when to save. Raises `ValueError` for a time that never passes."""
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from distrace.cli.common import Flag, ModelName, default, opened
+from distrace.cli.common import NONE, Flag, ModelName, default, opened
 from distrace.cli.completion import Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
@@ -42,7 +42,9 @@ class Complete:
     """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
-    inputs: tyro.conf.Positional[Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT")]]
+    inputs: tyro.conf.Positional[
+        Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT …", help_behavior_hint="(required)")]
+    ]
     """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world"""
     out: Path = Path("out/complete")
     up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
@@ -61,7 +63,8 @@ class Complete:
     seed: int = 0
     resolution: int = 128  # cells along each side of the mesh's grid; 256 keeps parts thinner than 1/64 whole
     device: str = "cpu"
-    ignore: tuple[Literal["mask", "normal"], ...] = ()  # canonical: parts to ignore; only adam uses a view's normals
+    ignore: Annotated[tuple[Literal["mask", "normal"], ...], NONE] = ()
+    """canonical: parts to ignore; only adam uses a view's normals"""
     solver: Literal["lm", "adam"] = "lm"  # canonical: Levenberg–Marquardt, or Adam as in DIST; clouds need lm
     iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None  # canonical
     starts: Annotated[int | None, default("8 of lm, 3 of adam", "INT")] = None  # canonical: of the multi-start fit
@@ -109,8 +112,8 @@ class Complete:
         iterations = chosen.iterations if self.iterations is None else self.iterations
         starts = chosen.starts if self.starts is None else self.starts
         fit = chosen(iterations=iterations, starts=starts, seed=self.seed)
-        full = load_cloud(path) if cloud else load_view(path)
-        known = (full if self.points is None else full.sparse(self.points, self.seed)).without(*self.ignore)
+        full = load_cloud(path) if cloud else load_view(path, self.ignore)
+        known = full if self.points is None else full.sparse(self.points, self.seed)
         self._check(path, known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
         return complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))

@@ -11,7 +11,7 @@ import tyro
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Flag, ModelName, check_distance, default, opened
+from distrace.cli.common import NONE, Flag, ModelName, check_distance, default, opened
 from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
 from distrace.errors import explained
@@ -36,7 +36,7 @@ class Pose:
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
     out: Path = Path("out/pose")
     code: str = "0"  # number of the training shape, or a code.npy that `complete` wrote
-    ignore: tuple[Literal["depth", "mask", "normal"], ...] = ()  # parts of the observation to ignore
+    ignore: Annotated[tuple[Literal["depth", "mask", "normal"], ...], NONE] = ()  # parts of the observation
     focal: Flag = False  # also find the focal length
     azimuth: Annotated[float | None, default("the observation's camera", "FLOAT")] = None
     """degrees, of the initial camera"""
@@ -52,13 +52,13 @@ class Pose:
     def run(self) -> None:
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
-        observed = read_view(self.observation).to(run.device)
+        observed = read_view(self.observation, self.ignore).to(run.device)
         field = model.field(_code(model, self.code))
         first = self._start(observed.camera)
         steps = []
         with progress("fitting", STEPS) as bar:
             config = CameraConfig(starts=self.starts, focal=self.focal, seed=self.seed)
-            for step in fit_camera(field, observed.without(*self.ignore), first, config):
+            for step in fit_camera(field, observed, first, config):
                 steps.append(step)
                 bar.advance(f"start {step.start + 1}, loss {step.loss:.4f}, {step.off:.1%} of the rays off")
         last = steps[-1]

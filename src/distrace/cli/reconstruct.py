@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
-from distrace.cli.common import Every, Flag, Views
+from distrace.cli.common import NONE, Every, Flag, Views
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
 from distrace.data.photograph import Photograph
@@ -48,7 +49,7 @@ class Reconstruct:
     width: int = SurfaceSpecs.width  # of the surface's network
     silhouettes_only: Flag = False  # fit the shape to silhouettes alone; colours do not shape it
     held_out: int = 8  # compare one view in so many instead of fitting to it; 0 for none
-    leave_out: tuple[str, ...] = ()  # names of views to ignore
+    leave_out: Annotated[tuple[str, ...], NONE] = ()  # names of views to ignore
     resolution: int = 256  # cells along each side of the mesh's grid
     seed: int = 0
     save_every: float = 60.0  # seconds between checkpoints

@@ -11,7 +11,7 @@ import tyro
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import Every, default, opened
+from distrace.cli.common import NONE, Every, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
@@ -44,7 +44,8 @@ class Train:
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
     out: Path = Path("out/model")
-    split: tuple[Path, ...] = ()  # CSV files: train only on their training shapes and variants of these
+    split: Annotated[tuple[Path, ...], NONE] = ()
+    """CSV files: train only on their training shapes and variants of these"""
     minutes: Annotated[float | None, default("no limit", "FLOAT")] = None
     """wall-clock time; it sets the number of steps"""
     steps: Annotated[int | None, default(TrainConfig.steps)] = None  # a larger number prolongs a finished run

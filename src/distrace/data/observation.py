@@ -1,5 +1,6 @@
 """One observed view: a camera and what it saw. The file form is `OBSERVATION.npz`."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -77,42 +78,48 @@ class View:
         return replace(self, depth=depth)
 
 
-def load_view(path: Path) -> View:
-    """Reads `OBSERVATION.npz`, of a camera that sees the unit sphere.
+def load_view(path: Path, ignore: Sequence[str] = ()) -> View:
+    """Reads `OBSERVATION.npz`, of a camera that sees the unit sphere; `depth`, `mask` and `normal` can be ignored.
 
     Raises `ValueError`, in one sentence, for what is missing or makes no sense.
     """
-    view = read_view(path)
+    view = read_view(path, ignore)
     with about(path):
         check_place(view.camera, view.depth, view.observed)
     return view
 
 
-def read_view(path: Path) -> View:
+def read_view(path: Path, ignore: Sequence[str] = ()) -> View:
     """The same wherever the camera is. What lies outside of the mask is left out: it is not the object's."""
-    scene, mask = read_scene(path)
+    scene, mask = read_scene(path, ignore)
     with about(path):
         view = scene if mask is None else replace(scene, mask=mask).masked(mask)
+        view = view.without("depth") if "depth" in ignore else view
         if not view.observed.any():
-            raise ValueError("it shows nothing: no depth is finite and positive, and no pixel is marked as object")
+            left = f"without its {' and '.join(ignore)} " if ignore else ""
+            raise ValueError(
+                f"{left}it shows nothing: no depth is finite and positive, and no pixel is marked as object"
+            )
         if view.normal is not None:
             check_normals(view.camera, view.normal)
     return view
 
 
-def read_scene(path: Path) -> tuple[View, Bool[Tensor, "height width"] | None]:
+def read_scene(path: Path, ignore: Sequence[str] = ()) -> tuple[View, Bool[Tensor, "height width"] | None]:
     """Reads a view with all its depths, also those of other things than the object; and the object's mask, if known.
 
     Raises `ValueError`, in one sentence, for what is missing or makes no sense.
     """
-    arrays = read_arrays(path)
+    arrays = {name: array for name, array in read_arrays(path).items() if name == "depth" or name not in ignore}
     with about(path):
         depth = depth_image(arrays["depth"])
         size = depth.shape[0], depth.shape[1]
         camera = camera_of(arrays["intrinsics"], arrays["T_world_camera"], *size)
         mask = mask_image(arrays["mask"], *size) if "mask" in arrays else None
-        normal = normal_image(arrays["normal"], *size) if "normal" in arrays else None
-        scene = View(camera, depth, None, normal)
+        scene = View(camera, depth, None, None)
+        shows = scene.seen.any() or (mask is not None and mask.any())
+        if "normal" in arrays and (shows or arrays["normal"].any()):  # that of an empty render is zero
+            scene = replace(scene, normal=normal_image(arrays["normal"], *size))
         if mask is not None:
             check_mask(mask, scene.seen)
     return scene, mask
