@@ -68,17 +68,17 @@ def around() -> Photographs:
     cameras = [Camera.orbit(90 * k, 10, 3.0, height=160, width=160, focal_px=240.0) for k in range(4)]
     views = [Photograph(f"{k}", camera, image) for k, camera in enumerate(cameras)]
     half = ball(radius=20.0)
-    told = Placement(torch.zeros(3).double(), 1.0)
-    return Photographs((replace(views[0], mask=half), *views[1:]), told, "ours")
+    placement = Placement(torch.zeros(3).double(), 1.0)
+    return Photographs((replace(views[0], mask=half), *views[1:]), placement, "ours")
 
 
 def test_masks_that_are_given_stay_and_so_does_a_unit_sphere_that_was_told() -> None:
     given = around()
-    for told in (True, False):
-        found = masked(replace(given, told=told))
+    for known in (True, False):
+        found = masked(replace(given, sphere_known=known))
         assert torch.equal(found.views[0].known_mask, given.views[0].known_mask)
         assert all(view.known_mask.any() for view in found.views)
-        assert (found.placement.radius == given.placement.radius) == told
+        assert (found.placement.radius == given.placement.radius) == known
 
 
 def test_black_images_end_in_one_sentence() -> None:

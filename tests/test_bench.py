@@ -133,7 +133,7 @@ def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() ->
 
 
 def test_times_are_medians_of_runs_in_turn_and_of_one_where_it_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock advances by what is asked for at each look; two looks to a run."""
+    """The clock advances by what is requested at each look; two looks to a run."""
     with torch.no_grad():
         buffers = render(sphere(0.5), poster_view(8))
 

@@ -231,7 +231,7 @@ def test_loading_leaves_the_random_numbers_alone(tmp_path):
 def test_a_code_that_the_model_has_not_is_named(tmp_path):
     model = load_model(experiment(tmp_path / "chairs"))
     for number in (4, -1):
-        with pytest.raises(ValueError, match=rf"^code {number} was asked for; chairs has 4, counted from 0$"):
+        with pytest.raises(ValueError, match=rf"^code {number} was given; chairs has 4, counted from 0$"):
             model.field(number)
     with pytest.raises(ValueError, match=r"^a code of shape \[5\] was given; this decoder takes \[3\]$"):
         model.field(torch.zeros(5))

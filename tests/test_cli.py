@@ -462,8 +462,8 @@ BAD = [
     ("render {model} --size many", "'many'; expected --size INT pixels along each side (default: 512); see distrace"),
     ("render {model} --out {tmp}/text", "text is a file; give another to write to"),
     ("render {model} --out {tmp}/text/below", "text is a file; give another to write to"),
-    ("render {model} --code 2", "code 2 was asked for; spheres has 2"),
-    ("render {model} --code -1", "code -1 was asked for"),
+    ("render {model} --code 2", "code 2 was given; spheres has 2"),
+    ("render {model} --code -1", "code -1 was given"),
     ("render {model} --size -3", "-3 × -3"),
     ("render {model} --size 0", "0 × 0"),
     ("render {model} --size 4000000", "not enough memory"),
@@ -518,7 +518,7 @@ BAD = [
     ("complete {model} {view} --iterations 1 --resolution 3", "resolution of 3"),
     ("pose {model} {tmp}/missing.npz", "missing.npz does not exist"),
     ("pose {model} {tmp}/empty", "empty is not an observation"),
-    ("pose {model} {view} --code 7", "code 7 was asked for"),
+    ("pose {model} {view} --code 7", "code 7 was given"),
     ("pose {model} {view} --code {tmp}/text", "neither the number of a training shape nor a code.npy"),
     ("pose {model} {view} --ignore depth mask", "view.npz: without its depth and mask it shows nothing"),
     ("pose {model} {empty}", "empty.npz: it shows nothing"),
@@ -546,8 +546,8 @@ BAD = [
     ("train {tmp}/samples", "is not a file of samples"),
     ("train {tmp}/good --split sofas", "there is no split sofas; give a CSV file"),
     ("train {tmp}/good --out {tmp}/stopped", "is not a checkpoint of a training run"),
-    ("train {tmp}/good --wrong-sign 0", "wrong sign 0 times"),
-    ("train {tmp}/good --large -1", "above -1 squared"),
+    ("train {tmp}/good --wrong-sign 0", "wrong_sign=0 and"),
+    ("train {tmp}/good --large -1", "large=-1 were given"),
     ("train {tmp}/good --layers 2 --width 4", "each must be at least 1"),
     ("train {tmp}/good --code-length 0", "each must be at least 1"),
 ]
@@ -630,5 +630,5 @@ def test_a_closed_pipe_ends_what_is_printed_not_the_command(model: Path, tmp_pat
 def test_a_camera_refuses_sizes_that_are_no_whole_numbers() -> None:
     program = "import distrace; distrace.Camera.orbit(0, 0, 2, height=2.5)"  # a process without checks of types
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    sentence = "ValueError: an image of 2.5 × 512 pixels was asked for; both must be whole numbers from 1"
+    sentence = "ValueError: an image of 2.5 × 512 pixels was given; both must be whole numbers from 1"
     assert done.stderr.splitlines()[-1] == sentence

@@ -110,8 +110,8 @@ def test_a_derivative_that_disagrees_is_status_1_and_said(
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ("--code 3", "code 3 was asked for"),
-        ("--code -1", "code -1 was asked for"),
+        ("--code 3", "code 3 was given"),
+        ("--code -1", "code -1 was given"),
         ("--size 0", "0 × 0"),
         ("--distance 0", "its own place"),
         ("--distance 9000 --focal-mm 1", "sees nothing"),

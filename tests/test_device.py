@@ -24,7 +24,7 @@ from distrace.report import views_page
 from distrace.training.config import TrainConfig
 from experiments.baselines.deepsdf import SampleFitConfig
 from experiments.tables import methods
-from experiments.tables.methods import CLOUDS, METHODS, completed_by, told
+from experiments.tables.methods import CLOUDS, METHODS, completed_by, observation_of
 
 Command = Callable[..., None]
 
@@ -95,7 +95,7 @@ def test_what_was_seen_is_brought_to_the_model(method: str, model: Path, monkeyp
     monkeypatch.setattr(methods, "DEEPSDF", SampleFitConfig(samples=100, iterations=3))
     for config in (CodeFitConfig(iterations=1, starts=1), FitConfig(iterations=2, starts=1)):
         with pretended(monkeypatch):
-            fit = completed_by(method, load_model(model).to("meta"), told(view, method), config)
+            fit = completed_by(method, load_model(model).to("meta"), observation_of(view, method), config)
             assert fit.code.device == DEVICE
             assert fit.code.cpu().isfinite().all()
 

@@ -68,12 +68,12 @@ def test_a_torus_keeps_its_hole() -> None:
 
 def test_cells_are_passed_over_only_where_there_is_no_surface() -> None:
     """The same triangles as on the whole grid, from a fraction of its values."""
-    asked = 0
+    evaluations = 0
     thin = primitives.box(torch.tensor([0.71, 0.02, 0.43]))
 
     def watched(points: torch.Tensor) -> torch.Tensor:
-        nonlocal asked
-        asked += len(points)
+        nonlocal evaluations
+        evaluations += len(points)
         return thin(points)
 
     mesh = extract_mesh(watched, MeshConfig(resolution=64))
@@ -82,7 +82,7 @@ def test_cells_are_passed_over_only_where_there_is_no_surface() -> None:
     vertices, faces, _, _ = marching_cubes(grid, 0.0)
     assert len(mesh.faces) == len(faces)
     np.testing.assert_allclose(np.sort(mesh.vertices, axis=0), np.sort(vertices / 32 - 1, axis=0), atol=1e-5)
-    assert asked < 65**3 / 4
+    assert evaluations < 65**3 / 4
 
 
 def test_what_is_beyond_the_ball_is_no_part_of_the_shape() -> None:

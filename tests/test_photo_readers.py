@@ -1,4 +1,4 @@
-"""The layouts of other tools: each written by the test from known cameras, read back, and told where it is wrong."""
+"""The layouts of other tools: each written by the test from known cameras, read back, and refused where it is wrong."""
 
 import json
 import math
@@ -33,7 +33,7 @@ OPENGL = np.diag([1.0, -1, -1, 1])
 
 
 def frames(folder: Path, change: Callable[[dict], object] = lambda content: None) -> Path:
-    """transforms.json with everything told for each frame."""
+    """transforms.json with everything given for each frame."""
     write_images(folder / "images", ".png")
     names = ("fl_x", "fl_y", "cx", "cy", "h", "w")
     entries = []

@@ -165,11 +165,11 @@ def test_each_corner_has_its_entry_and_fine_grids_share_theirs() -> None:
 def test_colour_refinement_changes_colours_alone(views: list[Photograph], fitted: Reconstruction) -> None:
     config = replace(SHORT, refinement_steps=60)
     state = deepcopy(fitted)
-    told = views[1:]
-    before = judged(state, told[0], 40)
-    list(reconstruct(told, state, config))
+    training = views[1:]
+    before = judged(state, training[0], 40)
+    list(reconstruct(training, state, config))
     assert state.step == config.total == fitted.step + 30
-    after = judged(state, told[0], 40)
+    after = judged(state, training[0], 40)
     assert after.psnr > before.psnr
     assert after.silhouette_iou == before.silhouette_iou
     for one, other in zip(state.surface.parameters(), fitted.surface.parameters(), strict=True):
@@ -385,9 +385,9 @@ def test_a_dark_background_gives_masks(views: list[Photograph]) -> None:
 
 
 def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
-    told, apart = parted(views, 4)
+    training, apart = parted(views, 4)
     assert [view.name for view in apart] == ["01", "05"]
-    assert len(told) == 6
+    assert len(training) == 6
     assert parted(views, 0) == (views, [])
     empty = replace(views[1], mask=torch.zeros_like(views[1].known_mask))
     assert [view.name for view in parted([views[0], empty, *views[2:]], 4)[1]] == ["05"]

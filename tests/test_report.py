@@ -172,8 +172,8 @@ def test_every_picture_is_a_png_with_a_caption(read: Reader) -> None:
 
 
 def test_both_directions_of_the_chamfer_distance_are_told_with_their_unit(read: Reader) -> None:
-    for told in ("0.1234", "0.5678", "0.6912", "× 1000", "30,000 points", "surface is missing", "should not be there"):
-        assert told in read.text, told
+    for words in ("0.1234", "0.5678", "0.6912", "× 1000", "30,000 points", "surface is missing", "should not be there"):
+        assert words in read.text, words
 
 
 def test_the_curves_have_their_names_and_the_chosen_start_is_told(read: Reader) -> None:

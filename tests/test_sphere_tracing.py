@@ -50,18 +50,18 @@ def ray(origin: list[float], direction: list[float]) -> Rays:
 
 
 class Watched:
-    """A field that remembers where it was asked."""
+    """A field that remembers where it was evaluated."""
 
     def __init__(self, sdf) -> None:
-        self.sdf, self.asked = sdf, []
+        self.sdf, self.evaluated = sdf, []
 
     def __call__(self, points: torch.Tensor) -> torch.Tensor:
-        self.asked.append(points)
+        self.evaluated.append(points)
         return self.sdf(points)
 
     @property
     def count(self) -> int:
-        return sum(len(points) for points in self.asked)
+        return sum(len(points) for points in self.evaluated)
 
 
 @every_strategy
@@ -109,13 +109,13 @@ def test_a_hit_lies_on_its_ray_where_the_field_was_asked(config: TraceConfig) ->
     rays = camera.rays()[traced.hit]
     ends = rays.at(traced.distance[traced.hit])
     assert scene(ends).abs().max() < 5e-5
-    asked = torch.cat(watched.asked)
-    asked = asked[scene(asked).abs() < 5e-5]  # samples at which a ray may end
+    samples = torch.cat(watched.evaluated)
+    samples = samples[scene(samples).abs() < 5e-5]  # samples at which a ray may end
     from_ray = torch.linalg.cross(
-        asked[None] - rays.origins[:, None], rays.directions[:, None].expand(-1, len(asked), 3)
+        samples[None] - rays.origins[:, None], rays.directions[:, None].expand(-1, len(samples), 3)
     ).norm(dim=-1)
     on_ray = from_ray < 1e-9
-    nearest = torch.where(on_ray, torch.cdist(ends, asked), torch.inf).amin(dim=1)
+    nearest = torch.where(on_ray, torch.cdist(ends, samples), torch.inf).amin(dim=1)
     assert nearest.max() < 20 * 5e-5
 
 
@@ -170,7 +170,7 @@ def test_each_strategy_of_the_table_asks_less_than_the_one_before() -> None:
     for config in MARCHES.values():
         watched = Watched(primitives.sphere(0.5))
         traced = render(watched, camera, config=config).trace
-        assert traced.total_evaluations == watched.count  # nothing is asked that is not counted
+        assert traced.total_evaluations == watched.count  # every evaluation is counted
         counts.append(watched.count)
     assert list(MARCHES) == ["parallel", "dynamic", "aggressive", "coarse_to_fine"]
     assert counts == sorted(counts, reverse=True)
@@ -254,14 +254,14 @@ def test_a_ray_is_not_followed_back_out_of_its_bounds() -> None:
     watched = Watched(primitives.plane(torch.tensor([0, 0, 1], dtype=f64), 1.05))
     traced = trace(watched, ray([0, 0, 3], [0, 0, -1]), start=torch.tensor([2.05], dtype=f64))
     assert traced.outcome.item() == Outcome.INSIDE
-    assert torch.cat(watched.asked)[:, 2].tolist() == pytest.approx([0.95, 1.0])
+    assert torch.cat(watched.evaluated)[:, 2].tolist() == pytest.approx([0.95, 1.0])
 
 
 def test_closest_is_the_sample_of_least_value() -> None:
     rays, watched = ray([0, 0.7, 3], [0, 0, -1]), Watched(primitives.sphere(0.5))
     traced = trace(watched, rays)
-    asked = torch.cat(watched.asked)
-    least = asked[watched.sdf(asked).abs().argmin()]
+    samples = torch.cat(watched.evaluated)
+    least = samples[watched.sdf(samples).abs().argmin()]
     torch.testing.assert_close(rays.at(traced.closest)[0], least)
     across = trace(primitives.sphere(0.45), ray([0, 0, 3], [0, 0, -1]), replace(AGGRESSIVE, step_scale=2.5, steps=4))
     assert across.outcome.item() == Outcome.EXHAUSTED  # at −0.075, after +0.05
@@ -280,7 +280,7 @@ def test_a_tolerance_per_ray_is_kept_per_ray() -> None:
 
 
 @every_strategy
-@pytest.mark.parametrize("number_at_nan", [False, True], ids=["", "and a number where it is asked at NaN"])
+@pytest.mark.parametrize("number_at_nan", [False, True], ids=["", "and a number where it is evaluated at NaN"])
 def test_a_ray_whose_field_gives_nan_ends_there_and_is_no_hit(config: TraceConfig, number_at_nan: bool) -> None:
     def broken(points: torch.Tensor) -> torch.Tensor:
         value = points.norm(dim=-1) - 0.5
@@ -296,7 +296,7 @@ def test_a_ray_whose_field_gives_nan_ends_there_and_is_no_hit(config: TraceConfi
     torch.testing.assert_close(traced.distance[~spoilt], whole.distance[~spoilt])
     for state in (traced.closest, traced.stopped):
         assert not state.isnan().any()
-    assert torch.cat(watched.asked).isfinite().all()
+    assert torch.cat(watched.evaluated).isfinite().all()
     if config.compaction:
         assert (traced.evaluations[spoilt] < whole.evaluations[spoilt]).all()
 
@@ -336,7 +336,7 @@ def test_a_field_too_steep_for_its_steps_is_hit_all_the_same(slope: float) -> No
 def test_without_polish_a_hit_is_a_sample() -> None:
     rays, watched = ray([0.2, 0.1, 3], [0, 0, -1]), Watched(primitives.sphere(0.5))
     traced = trace(watched, rays, replace(AGGRESSIVE, polish=False))
-    assert (watched.asked[-1] == rays.at(traced.distance)).all()
+    assert (watched.evaluated[-1] == rays.at(traced.distance)).all()
     true = meet_sphere(rays, 0.5).near
     assert 0 < (traced.distance - true).abs() < 1e-4
     assert (trace(watched, rays).distance - true).abs() < 1e-7
@@ -363,7 +363,7 @@ def test_a_least_step_is_kept_outside_and_not_in_the_solid() -> None:
     watched = Watched(primitives.plane(torch.tensor([0, 0, 1], dtype=f64)))
     config = replace(DYNAMIC, tolerance=1e-9, least_step=1e-3)
     trace(watched, ray([0, 0, 3], [0, 0, -1]), config, torch.tensor([2.9994], dtype=f64))
-    assert (3 - torch.cat(watched.asked)[:, 2]).tolist() == pytest.approx([2.9994, 3.0004, 3.0], abs=1e-9)
+    assert (3 - torch.cat(watched.evaluated)[:, 2]).tolist() == pytest.approx([2.9994, 3.0004, 3.0], abs=1e-9)
 
 
 def test_a_trace_is_indexed_as_its_images_are() -> None:

@@ -22,7 +22,7 @@ from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 from experiments.datasets.pictured import pictured
-from experiments.tables.methods import METHODS, completed_by, told
+from experiments.tables.methods import METHODS, completed_by, observation_of
 
 OBSERVATION_SIZE = 256
 SAMPLES = 40_000  # distances that a held-out shape is fitted to
@@ -87,7 +87,7 @@ def completion_results(
         solid = solid_of(shape, meshes)
         view = observe(solid, poster_view(OBSERVATION_SIZE)).sparse(points, config.seed)
         for method in METHODS:
-            observation = told(view, method)
+            observation = observation_of(view, method)
             fit = completed_by(method, model, observation, config)
             mesh = completed(model.field(fit.code), observation, MeshConfig(resolution))
             yield compared(shape.name, method, points, mesh, solid.surface, fit.seconds)

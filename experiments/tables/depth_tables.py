@@ -12,7 +12,7 @@ from distrace.report.page import Html, figure, page, paragraph, section, table
 from distrace.shading import Picture, grid
 from experiments.charts import steps_chart
 from experiments.datasets.pictured import pictured
-from experiments.tables.methods import told
+from experiments.tables.methods import observation_of
 from experiments.tables.sparse_depth import DENSITIES, SIZE, Done, camera_of, observed, surface_of, true_solid
 from experiments.tables.trials import Place, grouped
 
@@ -164,7 +164,7 @@ def _strip(one: Done, results: Sequence[Done], methods: Sequence[str], place: Pl
 
 
 def _shaded(each: Done, camera: Camera, place: Place) -> Picture:
-    observation = told(observed(each.trial, place.meshes), each.trial.method)
+    observation = observation_of(observed(each.trial, place.meshes), each.trial.method)
     surface = surface_of(place, each.trial, observation, torch.tensor(each.code))
     return _BLANK if surface is None else pictured(Solid(surface, surface), camera)
 

@@ -16,7 +16,7 @@ CLOUDS = ("points", "points+normals")  # ours, not knowing the camera
 DEEPSDF = SampleFitConfig(samples=500)  # where the original has 8,000 in an iteration: docs/from_the_paper.md
 
 
-def told(view: View, method: str) -> View | Cloud:
+def observation_of(view: View, method: str) -> View | Cloud:
     """Returns the part of a view that a method uses; the view has normals where the method takes them.
 
     Raises `ValueError` for another method.
@@ -30,7 +30,7 @@ def told(view: View, method: str) -> View | Cloud:
 
 
 def completed_by(method: str, model: Model, seen: View | Cloud, config: FitConfig | CodeFitConfig) -> CodeFit:
-    """Completes what `told` returns by a method."""
+    """Completes what `observation_of` returns by a method."""
     if method != "deepsdf":
         return complete_shape(model, seen, config)
     cloud = seen.to(model.codes.device)

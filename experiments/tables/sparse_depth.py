@@ -25,7 +25,7 @@ from distrace.fitting.free_space import completed
 from distrace.metrics import chamfer
 from experiments.datasets.noise import NOISES, noisy
 from experiments.datasets.splits import on_side, shape_of
-from experiments.tables.methods import completed_by, settings_of, told
+from experiments.tables.methods import completed_by, observation_of, settings_of
 from experiments.tables.trials import Place, fingerprint, hash_of, read_json
 
 DENSITIES = ("dense", "50%", "10%", "100", "50", "20")
@@ -147,7 +147,7 @@ def done(place: Place, trial: Trial) -> Done:
         content = read_json(path)
         if content.pop("made_by", None) == mark:
             return Done(Trial(**content.pop("trial")), **content)
-    observation = told(observed(trial, place.meshes), trial.method)
+    observation = observation_of(observed(trial, place.meshes), trial.method)
     fit = completed_by(trial.method, model, observation, config)
     surface = surface_of(place, trial, observation, fit.code)
     truth = true_solid(place.meshes, trial.category, trial.shape).surface

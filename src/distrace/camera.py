@@ -190,8 +190,8 @@ class Camera(ByValue):
     def cropped(self, top: int, left: int, height: int, width: int) -> "Camera":
         """Returns the same camera with a part of its sensor. Raises `ValueError` for a part that it does not have."""
         if not (0 <= top < self.height and 0 <= left < self.width and height > 0 and width > 0):
-            size = f"{self.height} × {self.width} pixels"
-            raise ValueError(f"{height} × {width} pixels from row {top} and column {left} were asked for, of {size}")
+            size = f"an image of {self.height} × {self.width} pixels"
+            raise ValueError(f"{height} × {width} pixels from row {top} and column {left} were given, of {size}")
         intrinsics = self.intrinsics.clone()
         intrinsics[..., 0, 2] -= left
         intrinsics[..., 1, 2] -= top
@@ -227,7 +227,7 @@ class Camera(ByValue):
 
 def _check_size(height: int, width: int) -> None:
     if not all(isinstance(size, Integral) and size >= 1 for size in (height, width)):
-        raise ValueError(f"an image of {height} × {width} pixels was asked for; both must be whole numbers from 1")
+        raise ValueError(f"an image of {height} × {width} pixels was given; both must be whole numbers from 1")
 
 
 def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:

@@ -17,7 +17,7 @@ from distrace.tracing.tracer import TracerConfig
 
 Pictures = UInt8[np.ndarray, "frames height width 3"]
 
-FRAME = Fraction(8, 100)  # seconds, unless told; a GIF counts in hundredths
+FRAME = Fraction(8, 100)  # seconds, by default; a GIF counts in hundredths
 BT709 = 1  # H.264's number for the colours, the curve and the matrix of HD television
 
 
@@ -27,7 +27,7 @@ def turntable(camera: Camera, frames: int) -> list[Camera]:
     Raises `ValueError` for fewer than two frames.
     """
     if frames < 2:
-        raise ValueError(f"an orbit of {frames} frames was asked for; a turn takes at least 2")
+        raise ValueError(f"an orbit of {frames} frames was given; a turn takes at least 2")
     return [camera.turned(360 * frame / frames) for frame in range(frames)]
 
 

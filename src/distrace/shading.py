@@ -17,7 +17,7 @@ Colour = tuple[int, int, int]
 COLOUR_MAPS = ("viridis", "coolwarm")  # the rows of colour_maps.png, so that pictures need no matplotlib
 WHITE: Colour = (255, 255, 255)
 INK: Colour = (56, 64, 77)
-# Told apart by people who see no difference between red and green.
+# Distinct also to people with red-green colour blindness.
 AGREE: Colour = (200, 206, 214)
 MISSING: Colour = (226, 112, 32)
 EXTRA: Colour = (44, 104, 190)

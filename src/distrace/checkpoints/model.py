@@ -59,7 +59,7 @@ class Model(ByValue):
         if isinstance(code, Tensor | np.ndarray):
             return self.decoder.field(code)
         if not 0 <= code < len(self.codes):
-            raise ValueError(f"code {code} was asked for; {self.name} has {len(self.codes)}, counted from 0")
+            raise ValueError(f"code {code} was given; {self.name} has {len(self.codes)}, counted from 0")
         return self.decoder.field(self.codes[code])
 
     def __repr__(self) -> str:

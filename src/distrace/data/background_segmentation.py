@@ -52,7 +52,8 @@ def masked(photographs: Photographs) -> Photographs:
         raise ValueError(
             f"in {len(empty)} of {len(found)} views, as {empty[0]}, nothing stands out from the dark; give masks"
         )
-    return replace(photographs, views=found) if photographs.told else _placed_again(replace(photographs, views=found))
+    photographs = replace(photographs, views=found)
+    return photographs if photographs.sphere_known else _placed_again(photographs)
 
 
 def dark_masks(images: Sequence[Float[torch.Tensor, "_ _ 3"]]) -> list[Bool[torch.Tensor, "_ _"]]:

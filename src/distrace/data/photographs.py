@@ -29,7 +29,7 @@ LOOKED_FOR = (
 )
 MAX_SHARE_BEYOND = 0.05  # of the masks' pixels: with more, the unit sphere is smaller than the object
 MAX_PIXELS = 20_000  # pixels of a mask that are examined
-MAX_WHITE_SHARE = 0.9  # of the pixels: with so many at full white, nothing is told by colour
+MAX_WHITE_SHARE = 0.9  # of the pixels: with so many at full white, colour tells nothing
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Photographs:
     views: tuple[Photograph, ...]
     placement: Placement
     layout: str
-    told: bool = False  # whether the folder says where the unit sphere lies
+    sphere_known: bool = False  # whether the folder says where the unit sphere lies
 
 
 def load_photographs(folder: Path) -> Photographs:
@@ -124,8 +124,8 @@ def _photograph(shot: Shot) -> Photograph:
         mask = mask if shot.mask is None else read_mask(shot.mask)
         height, width = image.shape[:2]
         if shot.size not in (None, (height, width)):
-            told = f"{shot.size[0]} × {shot.size[1]}"
-            raise ValueError(f"{shot.image} has {height} × {width} pixels, and the camera's image {told}")
+            stated = f"{shot.size[0]} × {shot.size[1]}"
+            raise ValueError(f"{shot.image} has {height} × {width} pixels, and the camera's image {stated}")
         if mask is not None and mask.shape != image.shape[:2]:
             other = f"{mask.shape[0]} × {mask.shape[1]}"
             raise ValueError(f"{shot.mask} has {other} pixels, and its image {shot.image.name} {height} × {width}")

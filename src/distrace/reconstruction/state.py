@@ -50,10 +50,10 @@ class ReconstructConfig:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.rays < 4 or not self.sizes or min(self.sizes) < 8:
             given = f"{self.steps} steps of {self.rays} rays and images of {self.sizes} pixels"
-            raise ValueError(f"{given} were asked for; at least 1 step, 4 rays and 8 pixels are needed")
+            raise ValueError(f"{given} were given; at least 1 step, 4 rays and 8 pixels are needed")
         if self.refinement_steps < 0 or self.refinement_pixels < 1:
             given = f"{self.refinement_steps} refinement steps of {self.refinement_pixels} pixels"
-            raise ValueError(f"{given} were asked for; at least 0 steps and 1 pixel are needed")
+            raise ValueError(f"{given} were given; at least 0 steps and 1 pixel are needed")
 
     @property
     def total(self) -> int:

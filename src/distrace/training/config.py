@@ -30,15 +30,13 @@ class TrainConfig:
     def __post_init__(self) -> None:
         if self.steps < 1 or self.samples_per_step < 1 or not 0 <= self.seed < 2**31:
             given = f"{self.steps} steps of {self.samples_per_step} samples with seed {self.seed}"
-            raise ValueError(f"{given} were asked for; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
+            raise ValueError(f"{given} were given; at least one of each, and a seed from 0 to 2³¹ − 1, are needed")
         if not (self.wrong_sign > 0 and self.large > 0):
-            given = f"a wrong sign {self.wrong_sign:g} times as much, and errors above {self.large:g} squared"
-            raise ValueError(f"{given} were asked for; both must be above 0")
+            given = f"wrong_sign={self.wrong_sign:g} and large={self.large:g}"
+            raise ValueError(f"{given} were given; both must be above 0")
         if not (0 < self.learning_rate < math.inf and 0 < self.variant_weight <= 1 and self.dwell >= 1):
-            given = f"a rate of {self.learning_rate:g}, variants at {self.variant_weight:g}, places {self.dwell} times"
-            needed = "a rate above 0, a share above 0 and up to 1, and a whole number from 1"
-            raise ValueError(f"{given} were asked for; {needed} are needed")
+            given = f"learning_rate={self.learning_rate:g}, variant_weight={self.variant_weight:g}, dwell={self.dwell}"
+            needed = "a rate above 0, a weight above 0 and up to 1, and a whole number from 1"
+            raise ValueError(f"{given} were given; {needed} are needed")
         if not 0 <= self.keep < math.inf:
-            raise ValueError(
-                f"to keep a model {self.keep:g} times as much was asked for; 0 or a number above is needed"
-            )
+            raise ValueError(f"keep={self.keep:g} was given; 0 or a number above is needed")

@@ -38,8 +38,8 @@ def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
         _check_distortion(entry)
         image = file_of(folder, entry, "file_path", ("", *SUFFIXES))
         mask = file_of(folder, entry, "mask_path", ("", *SUFFIXES)) if entry.get("mask_path") is not None else None
-        told = "w" in entry and "h" in entry
-        size = (int(_number(entry, "h")), int(_number(entry, "w"))) if told else picture_size(image)
+        has_size = "w" in entry and "h" in entry
+        size = (int(_number(entry, "h")), int(_number(entry, "w"))) if has_size else picture_size(image)
         pose = matrix(entry, "transform_matrix", 4, 4) @ OPENGL
         return Shot(f"{field}.transform_matrix", image, _intrinsics(entry, *size), pose, mask, size)
 
@@ -68,7 +68,7 @@ def _intrinsics(entry: dict[str, Any], height: int, width: int) -> np.ndarray:
 
 
 def _focal(entry: dict[str, Any], axis: str, length: int) -> float | None:
-    """In pixels; None where it is not told along this axis."""
+    """In pixels; None where it is not given along this axis."""
     if f"fl_{axis}" in entry:
         return _positive(entry, f"fl_{axis}", math.inf)
     if f"camera_angle_{axis}" in entry:
