@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from numbers import Integral
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,7 +11,7 @@ from torch.nn.functional import pad
 from distrace.equality import ByValue
 from distrace.rays import Rays
 from distrace.vectors import length, numbers
-from distrace.viewpoint import Number, Point, orbiting, together, upright
+from distrace.viewpoint import Number, Point, check_matrices, check_size, orbiting, together, upright
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -42,8 +41,8 @@ class Camera(ByValue):
                 f"matrices of shapes {given} were given; intrinsics are [3, 3] and T_world_camera is [4, 4], after the"
                 " same batch axes"
             )
-        _check_size(height, width)
-        _check_values(intrinsics, T_world_camera)
+        check_size(height, width)
+        check_matrices(intrinsics, T_world_camera)
         return Camera(intrinsics, T_world_camera, height, width)
 
     @staticmethod
@@ -63,7 +62,7 @@ class Camera(ByValue):
         length, a number or a tensor, is in pixels, or in mm together with the sensor's width in mm. Raises
         `ValueError` where the eye is at the target, a length is not positive, or shapes do not fit.
         """
-        _check_size(height, width)
+        check_size(height, width)
         given = focal_mm if focal_px is None else focal_px
         focal = given if focal_px is not None else width * given / sensor_mm if sensor_mm > 0 else 0.0
         lengths = torch.as_tensor(focal)
@@ -223,31 +222,3 @@ class Camera(ByValue):
         axes = (1,) * (pixels.dim() - 1)
         inverse = self.intrinsics.inverse().reshape(*self.intrinsics.shape[:-2], *axes, 3, 3)
         return (inverse * pad(pixels, (0, 1), value=1.0)[..., None, :]).sum(-1)
-
-
-def _check_size(height: int, width: int) -> None:
-    if not all(isinstance(size, Integral) and size >= 1 for size in (height, width)):
-        raise ValueError(f"an image of {height} × {width} pixels was given; both must be whole numbers from 1")
-
-
-def _check_values(intrinsics: Tensor, T_world_camera: Tensor) -> None:
-    if not (intrinsics.isfinite().all() and T_world_camera.isfinite().all()):
-        raise ValueError("the camera's matrices hold values that are not finite")
-    for name, matrix in (("intrinsics", intrinsics), ("T_world_camera", T_world_camera)):
-        last = matrix.detach()[..., -1, :]
-        if not torch.allclose(last, torch.eye(matrix.shape[-1], dtype=last.dtype, device=last.device)[-1]):
-            raise ValueError(f"the last row of {name} is {numbers(last)}, not 0 … 0 1; is the matrix transposed?")
-    focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
-    if not (focal > 0).all():
-        raise ValueError(f"focal lengths of {numbers(focal)} pixels were given; they must be positive")
-    if not (intrinsics.detach().det().abs() > 1e-6 * focal.prod(-1)).all():
-        raise ValueError(f"the intrinsics {numbers(intrinsics)} have no inverse; they map camera axes to pixels")
-    rotation = T_world_camera.detach()[..., :3, :3].double()
-    error = (
-        (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
-    )
-    if error > 1e-3 or (rotation.det() < 0).any():
-        raise ValueError(
-            f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right,"
-            " y down, z forward) to the world, without scale or mirroring"
-        )

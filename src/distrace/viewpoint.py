@@ -1,13 +1,15 @@
-"""Positions and orientations of cameras, from numbers or from tensors with gradients and batch axes."""
+"""Positions and orientations of cameras, from numbers or from tensors with gradients and batch axes; checks of both."""
 
 from collections.abc import Sequence
 from functools import reduce
+from numbers import Integral
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from distrace.errors import explained
+from distrace.vectors import numbers
 
 Number = float | Tensor
 Point = Tensor | tuple[float, float, float]
@@ -58,6 +60,36 @@ def upright(forward: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     right = torch.linalg.cross(forward, up)
     right = right / right.norm(dim=-1, keepdim=True)
     return torch.stack([right, torch.linalg.cross(forward, right), forward], dim=-1)
+
+
+def check_size(height: int, width: int) -> None:
+    """Raises `ValueError` for a height or width that is no whole number from 1."""
+    if not all(isinstance(size, Integral) and size >= 1 for size in (height, width)):
+        raise ValueError(f"an image of {height} × {width} pixels was given; both must be whole numbers from 1")
+
+
+def check_matrices(intrinsics: Tensor, T_world_camera: Tensor) -> None:
+    """Raises `ValueError` for matrices that are not those of a camera."""
+    if not (intrinsics.isfinite().all() and T_world_camera.isfinite().all()):
+        raise ValueError("the camera's matrices hold values that are not finite")
+    for name, matrix in (("intrinsics", intrinsics), ("T_world_camera", T_world_camera)):
+        last = matrix.detach()[..., -1, :]
+        if not torch.allclose(last, torch.eye(matrix.shape[-1], dtype=last.dtype, device=last.device)[-1]):
+            raise ValueError(f"the last row of {name} is {numbers(last)}, not 0 … 0 1; is the matrix transposed?")
+    focal = intrinsics.detach().diagonal(dim1=-2, dim2=-1)[..., :2]
+    if not (focal > 0).all():
+        raise ValueError(f"focal lengths of {numbers(focal)} pixels were given; they must be positive")
+    if not (intrinsics.detach().det().abs() > 1e-6 * focal.prod(-1)).all():
+        raise ValueError(f"the intrinsics {numbers(intrinsics)} have no inverse; they map camera axes to pixels")
+    rotation = T_world_camera.detach()[..., :3, :3].double()
+    error = (
+        (rotation @ rotation.transpose(-1, -2) - torch.eye(3, dtype=torch.float64, device=rotation.device)).abs().max()
+    )
+    if error > 1e-3 or (rotation.det() < 0).any():
+        raise ValueError(
+            f"the upper left of T_world_camera is no rotation (off by {error:.2g}); it maps camera axes (x right,"
+            " y down, z forward) to the world, without scale or mirroring"
+        )
 
 
 def _precision(given: Sequence[Tensor]) -> torch.dtype:

@@ -15,10 +15,8 @@ from distrace.equality import summary
 from distrace.fields.base import SDF, flattened, in_chunks
 from distrace.fields.batch import BatchField
 from distrace.fields.products import Layer, Product, evaluate_layers, joined, linear
+from distrace.fields.pruning import Activity
 
-OFF_MARGIN = 0.5  # standard deviations below zero at which a unit counts as off
-WIDTH_MULTIPLE = 16  # of pruned layers: processors multiply such matrices faster
-SAMPLE_STRIDE = 8  # deviations are measured at every so many points
 CHUNK = 1 << 20  # points evaluated at a time without derivatives
 RECORDED_CHUNK = 4096  # … and with them on a CPU: a layer's fresh activations then stay in the cache
 FAR = 0.1  # the distance at which DeepSDF clamps its samples: decoders are not trained on larger ones
@@ -224,32 +222,9 @@ class ShapeField:
 
         Around the points it has the same values to rounding, at half the cost for an 8 × 512 decoder near its surface.
         """
-        last = len(self.layers) - 1
         if not len(points) or self.decoder.has_layer_norms or self.decoder.training:
             return self(points), self  # a layer's norm is over all of its units
-        highest = [torch.full_like(bias, -torch.inf) for _, bias in self.layers[:last]]
-        deviation = [torch.zeros_like(bias) for _, bias in self.layers[:last]]
-
-        def watch(layer: int, x: Tensor) -> None:
-            highest[layer] = highest[layer].maximum(x.amax(0))
-            deviation[layer] = deviation[layer].maximum(x[::SAMPLE_STRIDE].std(0, correction=0))
-
-        values = in_chunks(partial(self.decoder._run, self.layers, watch=watch), RECORDED_CHUNK, points)
-        active = [_active_units(*both) for both in zip(highest, deviation, strict=True)]
+        units = Activity(self.layers)
+        values = in_chunks(partial(self.decoder._run, self.layers, watch=units.watch), RECORDED_CHUNK, points)
         with torch.enable_grad():  # the pruned field is as differentiable as the whole
-            return values, ShapeField(self.decoder, [self._pruned_layer(layer, active) for layer in range(last + 1)])
-
-    def _pruned_layer(self, layer: int, active: list[Int[Tensor, "_"]]) -> Layer:
-        """Returns a layer without the rows of its own inactive units, and without the columns of those before."""
-        weight, bias = self.layers[layer]
-        if layer:
-            point = torch.arange(len(self.layers[layer - 1][1]), weight.shape[1], device=weight.device)
-            weight = weight[:, torch.cat([active[layer - 1], point])]
-        return (weight[active[layer]], bias[active[layer]]) if layer < len(active) else (weight.contiguous(), bias)
-
-
-def _active_units(highest: Float[Tensor, "n"], deviation: Float[Tensor, "n"]) -> Int[Tensor, "m"]:
-    """Returns the units that come near zero or above, and a few more for a round width."""
-    level = highest / deviation.clamp_min(1e-12)
-    count = -(-int((level > -OFF_MARGIN).sum()) // WIDTH_MULTIPLE) * WIDTH_MULTIPLE
-    return level.topk(min(max(count, WIDTH_MULTIPLE), len(level))).indices.sort().values
+            return values, ShapeField(self.decoder, units.pruned())
