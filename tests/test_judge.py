@@ -24,7 +24,7 @@ def directions(count: int) -> Tensor:
 def scan() -> Scan:
     """The front of a sphere, seen along z, and a little of what is behind."""
     points = directions(2000)
-    return scan_of_points(PLACE.to_world(0.6 * points[points[:, 2] > -0.5]), Up.told("y"))
+    return scan_of_points(PLACE.to_world(0.6 * points[points[:, 2] > -0.5]), Up.along("y"))
 
 
 def with_rays(seen: Scan, x: Tensor) -> Scan:
@@ -55,7 +55,7 @@ def test_points_away_from_the_surface_tell(radius: float, name: str) -> None:
 
 def test_a_shape_far_larger_than_what_was_seen_is_doubtful() -> None:
     points = 0.6 * directions(40_000)
-    cap = scan_of_points(PLACE.to_world(points[points[:, 2] > 0.57]), Up.told("y"))
+    cap = scan_of_points(PLACE.to_world(points[points[:, 2] > 0.57]), Up.along("y"))
     verdict = judged(cap, SPHERE, PLACE)
     assert verdict.explained > 0.99
     assert verdict.name in ("doubtful", "failed")

@@ -80,7 +80,7 @@ def test_the_true_place_is_among_the_first_proposals() -> None:
     prior = prior_of(codes)
     turn = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.6, 0.0]))
     true = Similarity(turn, torch.tensor([10.0, -4.0, 3.0]), torch.tensor(5.0))
-    scan = scan_of_points(true.to_world(box_points(3000)), Up.told("y"))
+    scan = scan_of_points(true.to_world(box_points(3000)), Up.along("y"))
     with torch.no_grad():
         found = proposed(scan, decoder, prior, 6, 0)
     assert [each.start for each in found] == list(range(6))

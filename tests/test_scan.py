@@ -45,7 +45,7 @@ def on_ball(scan: Scan) -> float:
 
 def test_a_mask_tells_the_points_and_depths_tell_free_space() -> None:
     scene, mask = room()
-    scan = scan_of_view(scene, mask, Up.told("y"))
+    scan = scan_of_view(scene, mask, Up.along("y"))
     assert on_ball(scan) == 1
     assert len(scan.points) == int(mask.sum())
     ending = scan.free_until.isfinite()
@@ -58,7 +58,7 @@ def test_a_mask_tells_the_points_and_depths_tell_free_space() -> None:
 
 def test_a_clean_background_is_free_all_along() -> None:
     scene, mask = room()
-    scan = scan_of_view(scene.masked(mask), mask, Up.told("y"))
+    scan = scan_of_view(scene.masked(mask), mask, Up.along("y"))
     beside = scan.free_until.isinf()
     assert beside.any()
     assert not meet_sphere(scan.free[beside], RADIUS).meets.any()
@@ -78,7 +78,7 @@ def test_a_rectangle_leaves_out_the_floor_and_other_things() -> None:
     rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
     box = torch.zeros_like(mask)
     box[int(rows[0]) - 4 : int(rows[-1]) + 8, int(columns[0]) - 8 : HEIGHT] = True
-    scan = scan_of_view(scene, box, Up.told("y"), isolate=True)
+    scan = scan_of_view(scene, box, Up.along("y"), isolate=True)
     assert (scene.seen & box & ~mask).sum() > mask.sum() / 2, "much in the rectangle is not the ball"
     assert on_ball(scan) > 0.97
     assert len(scan.points) > 0.8 * int(mask.sum())
@@ -86,7 +86,7 @@ def test_a_rectangle_leaves_out_the_floor_and_other_things() -> None:
 
 def test_nothing_is_below_the_floor() -> None:
     scene, mask = room()
-    scan = scan_of_view(scene, mask, Up.told("y"))
+    scan = scan_of_view(scene, mask, Up.along("y"))
     level = scan.free.directions[:, 1].abs() < 0.02
     heights = scan.free.origins[level, 1]
     assert int(level.sum()) > 1000
@@ -118,12 +118,12 @@ def test_without_a_floor_a_camera_may_look_down() -> None:
 
 def test_nothing_is_free_around_a_cloud_and_noise_is_told() -> None:
     points = torch.nn.functional.normalize(torch.randn(4000, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
-    clean = scan_of_points(50 * points, Up.told("unknown"))
+    clean = scan_of_points(50 * points, Up.along("unknown"))
     assert not len(clean.free_until)
     assert not len(clean.ups)
     assert clean.radius == pytest.approx(62.5, rel=0.05), "a fifth of the points might be outliers"
     away = torch.randn(4000, 1, generator=torch.Generator().manual_seed(1))
-    noisy = scan_of_points(50 * points + 2.0 * away * points, Up.told("z"))
+    noisy = scan_of_points(50 * points + 2.0 * away * points, Up.along("z"))
     assert noisy.noise == pytest.approx(2.0, rel=0.25)
     assert clean.noise < 0.3
     assert noisy.ups.tolist() == [[0, 0, 1]]
@@ -132,7 +132,7 @@ def test_nothing_is_free_around_a_cloud_and_noise_is_told() -> None:
 def test_points_far_from_everything_are_left_out() -> None:
     points = torch.randn(1000, 3, generator=torch.Generator().manual_seed(0))
     points[:5] = torch.tensor([1e4, 0.0, 0.0])
-    assert len(scan_of_points(points, Up.told("y")).points) == 995
+    assert len(scan_of_points(points, Up.along("y")).points) == 995
 
 
 @pytest.mark.parametrize(
@@ -141,7 +141,7 @@ def test_points_far_from_everything_are_left_out() -> None:
 )
 def test_too_few_points_are_refused(points: torch.Tensor, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
-        scan_of_points(points, Up.told("y"))
+        scan_of_points(points, Up.along("y"))
 
 
 def test_files_of_all_kinds_are_read(tmp_path: Path) -> None:
@@ -170,7 +170,7 @@ def test_files_of_all_kinds_are_read(tmp_path: Path) -> None:
 
 def test_joined_scans_keep_all_rays() -> None:
     scene, mask = room()
-    scan = scan_of_view(scene, mask, Up.told("y"))
+    scan = scan_of_view(scene, mask, Up.along("y"))
     both = joined([scan, scan])
     assert len(both.free_until) == 2 * len(scan.free_until) == len(both.free.origins)
 

@@ -108,7 +108,7 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
             return Placed(PlacedTrial(**content.pop("trial")), **content)
     solid = true_solid(place.meshes, trial.category, trial.shape)
     scene = sensed(solid, hash_of(trial.shape) + trial.scene, trial.hidden)
-    scan = scan_of_view(scene.view, scene.mask, Up.told("y"))
+    scan = scan_of_view(scene.view, scene.mask, Up.along("y"))
     known = scene.place if trial.told else None
     fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known)
     degrees, size, centre = placement_error(fit.place, scene.place, symmetric_turns(place.meshes, trial))

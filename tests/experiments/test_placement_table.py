@@ -27,7 +27,7 @@ from experiments.tables.placement import (
 def test_a_scene_shows_its_object_where_it_says(hidden: bool) -> None:
     mesh = normalised(trimesh.creation.box((1.0, 0.6, 0.8)))
     scene = sensed(Solid(mesh, mesh), 3, hidden)
-    scan = scan_of_view(scene.view, scene.mask, Up.told("y"))
+    scan = scan_of_view(scene.view, scene.mask, Up.along("y"))
     beyond = scene.place.to_object(scan.points).abs() - torch.tensor(mesh.extents).float() / 2
     on_surface = beyond.amax(-1).abs() < 0.05
     assert on_surface.float().mean() > 0.85, "the rest of the mask is wrong"

@@ -14,7 +14,7 @@ from distrace.data.cloud import Cloud, read_points
 from distrace.data.depth_image import KINDS, load_depth_image, load_intrinsics, load_mask
 from distrace.data.observation import View, read_scene
 from distrace.data.points import LEAST_POINTS, noise_of, object_points, radius_of, thinned
-from distrace.data.up import TOLD_TILT, Floor, Up, find_floor, rays_below
+from distrace.data.up import GIVEN_TILT, Floor, Up, find_floor, rays_below
 from distrace.errors import about
 from distrace.rays import Rays
 
@@ -41,7 +41,7 @@ class Scan:
     hits: Rays  # which meet the object, nobody says where
     noise: float  # standard deviation of the points about the surface
     ups: Float[Tensor, "k 3"]
-    tilt: float = TOLD_TILT  # standard deviation, in radians
+    tilt: float = GIVEN_TILT  # standard deviation, in radians
     views: tuple[View, ...] = ()  # cameras, depths and masks of the object alone
 
     @property
@@ -114,7 +114,7 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up,
     around = _around(inside)
     floor = None if up.direction is None else find_floor(thinned(scene.masked(around).points()), up)
     if floor is not None:
-        up = Up(floor.normal, floor.normal[None], TOLD_TILT)
+        up = Up(floor.normal, floor.normal[None], GIVEN_TILT)
     points = scene.masked(inside).points()
     kept = object_points(points, floor, 1.0) if isolate else object_points(points, None)
     pixels = inside.nonzero()[~kept]
@@ -170,7 +170,7 @@ def scan_of_points(points: Float[Tensor, "n 3"], up: Up) -> Scan:
 
 def canonical_scan(seen: View | Cloud) -> Scan:
     """Returns what was seen of a shape that lies as the model's do; it may be a silhouette alone."""
-    up = Up.told("y").candidates
+    up = Up.along("y").candidates
     if isinstance(seen, Cloud):
         return Scan(seen.points, NO_RAYS, torch.empty(0), NO_RAYS, noise_of(seen.points), up)
     points = seen.points()
@@ -187,16 +187,16 @@ def _load(path: Path, options: ScanOptions) -> Scan:
         _refuse(path, "is an image's", mask=options.mask, box=options.box)
         points = torch.from_numpy(read_points(path)).float()
         with about(path):
-            return scan_of_points(points, Up.told(options.up or "y"))
+            return scan_of_points(points, Up.along(options.up or "y"))
     if kind not in KINDS:
         scene, mask = read_scene(path)
-        up = Up.told(options.up or "y")
+        up = Up.along(options.up or "y")
     elif options.intrinsics is None:
         raise ValueError(f"{path} is a depth image, and needs --intrinsics: fx,fy,cx,cy in pixels, or a file")
     else:
         depth = load_depth_image(path)
         scene, mask = View(load_intrinsics(options.intrinsics, depth.shape[0], depth.shape[1]), depth), None
-        up = Up.told(options.up) if options.up else Up.of_camera()
+        up = Up.along(options.up) if options.up else Up.of_camera()
     with about(path):
         return _scan_of_image(scene, mask, options, up)
 

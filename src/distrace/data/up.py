@@ -17,7 +17,7 @@ FLOOR_SHARE = 0.05  # of the points, at least
 FLOOR_TRIALS = 300
 FLOOR_RAYS = 2000  # just below the floor, where nothing of the object is, …
 FLOOR_REACH = 1.5  # … within so many radii of its middle
-TOLD_TILT = 0.1  # radians: an object's own up is that near to the one that is told, or to the floor's normal
+GIVEN_TILT = 0.1  # radians: an object's own up is that near to the given one, or to the floor's normal
 PITCHED_TILT = 0.15  # radians: the same about the candidates of a camera's frame
 PITCHES = (0.0, 15.0, 30.0)  # degrees, by which a camera looks down
 
@@ -31,12 +31,12 @@ class Up:
     tilt: float
 
     @staticmethod
-    def told(axis: str) -> "Up":
-        """Returns what a user says: an axis of `AXES`, or `unknown`."""
+    def along(axis: str) -> "Up":
+        """Returns up as a user gives it: an axis of `AXES`, or `unknown`."""
         if axis == "unknown":
             return Up(None, torch.empty(0, 3), torch.inf)
         direction = torch.tensor(AXES[axis], dtype=torch.float32)
-        return Up(direction, direction[None], TOLD_TILT)
+        return Up(direction, direction[None], GIVEN_TILT)
 
     @staticmethod
     def of_camera() -> "Up":

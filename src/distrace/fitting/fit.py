@@ -41,7 +41,7 @@ class FitConfig:
     def __post_init__(self) -> None:
         if min(self.iterations, self.starts) < 1:
             given = f"{self.iterations} iterations and {self.starts} starts"
-            raise ValueError(f"{given} were asked for; each must be at least 1")
+            raise ValueError(f"{given} were given; each must be at least 1")
 
     @property
     def tried(self) -> int:

@@ -1,4 +1,4 @@
-"""The camera of one view of a known shape: its pose, and its focal length if asked for, by least squares."""
+"""The camera of one view of a known shape: its pose, and its focal length if it is unknown, by least squares."""
 
 import math
 from collections.abc import Iterator
@@ -48,7 +48,7 @@ class CameraConfig:
 
     def __post_init__(self) -> None:
         if self.starts < 1 or self.rays < 10:
-            raise ValueError(f"{self.starts} starts and {self.rays} rays were asked for; it takes at least 1 and 10")
+            raise ValueError(f"{self.starts} starts and {self.rays} rays were given; it takes at least 1 and 10")
 
 
 @dataclass(frozen=True)

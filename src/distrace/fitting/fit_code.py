@@ -15,7 +15,7 @@ from distrace.fields.precision import fastest
 from distrace.fitting.ray_sampling import Targets, drawn, pools_of
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample
-from distrace.fitting.solver import SolverConfig, cauchy
+from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
 from distrace.prior import START_DEVIATION, Prior
@@ -23,7 +23,11 @@ from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
-SOLVER = SolverConfig(damping=1e-2, even=True, kernel=cauchy, settled=1e-3)
+SOLVER = SolverConfig(damping=0.1, even=True, settled=0.0)
+CODE_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
+EFFECTIVE_RAYS = 4000.0  # what all rays count together: an exact silhouette says more than 100 depths
+MARGINS = (0.7, 0.25)  # deviations that a free ray keeps from the surface, in the rough round and in the last one
+ROUGH = 3.0  # × the deviation, in the first round
 
 
 @dataclass(frozen=True)
@@ -34,22 +38,24 @@ class CodeFitConfig:
     finalists: int = 3
     iterations: int = 16  # of the best start, of which three eighths are in the first round
     points: int = 500  # of each view, in the second round; a fifth in the first one
-    rays: int = 400  # the same; a third in the first round
-    deviation: float = 0.006  # of a shape that the model represents from the observation, in radii of the unit sphere
+    rays: int = 800  # the same; a third in the first round
+    deviation: float = 0.02  # of a shape that the model represents from the observation, in radii of the unit sphere
     seed: int = 0
 
     def __post_init__(self) -> None:
         if min(self.iterations, self.starts, self.finalists) < 1:
             given = f"{self.iterations} iterations and {self.starts} starts, {self.finalists} of them to the end,"
-            raise ValueError(f"{given} were asked for; each must be at least 1")
+            raise ValueError(f"{given} were given; each must be at least 1")
 
     @property
     def rounds(self) -> tuple[Round, ...]:
         """The rounds, the last of which is never empty."""
         first = self.iterations * 3 // 8
         every = 1 << 20  # dimensions: all that the prior has
-        rough = Round(self.starts, first, every, self.points // 5, self.rays // 3, SAMPLES, 3 * self.deviation)
-        fine = Round(self.finalists, self.iterations - first, every, self.points, self.rays, SAMPLES, self.deviation)
+        some = (self.points // 5, self.rays // 3, SAMPLES, ROUGH * self.deviation, charbonnier)
+        many = (self.points, self.rays, SAMPLES, self.deviation, charbonnier)
+        rough = Round(self.starts, first, every, *some)
+        fine = Round(self.finalists, self.iterations - first, every, *many)
         return (rough, fine) if first else (fine,)
 
     @property
@@ -178,7 +184,19 @@ def minimised(
     def problem_of(stage: Round) -> ScanProblem:
         sample = observed.draw(stage.points, stage.rays, random)
         deviation = (stage.deviation**2 + observed.noise**2) ** 0.5
-        return ScanProblem(quick, prior, sample, deviation, (), 0.0, stage.samples, moves=False, code_deviation=1.0)
+        return ScanProblem(
+            quick,
+            prior,
+            sample,
+            deviation,
+            starts=(),
+            tilt=0.0,
+            samples=stage.samples,
+            moves=False,
+            code_deviation=CODE_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
+            effective_rays=EFFECTIVE_RAYS,
+            margin=MARGINS[stage.deviation == config.deviation],
+        )
 
     return run_rounds(states, config.rounds, problem_of, SOLVER, progress)
 

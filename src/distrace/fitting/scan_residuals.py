@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.data.scan import Scan
+from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import FAR, Decoder
 from distrace.fields.precision import BFloat16Decoder
@@ -22,7 +23,7 @@ from distrace.rays import Rays, meet_sphere
 CODE_DEVIATION = 0.7  # of a code's coordinates from those of the training shape that it starts from
 GROWTH = 0.25  # standard deviation of the logarithm of the size, about the size that the start has
 EFFECTIVE_POINTS = 200.0  # what all points count together, however many: errors of a shape are alike nearby
-EFFECTIVE_RAYS = 600.0  # the same, of rays
+EFFECTIVE_RAYS = 600.0  # the same, of rays where a mask may be wrong
 FINE_SAMPLES = 4  # points about the least sample of a ray
 MARGIN = 0.7  # deviations that a free ray keeps from the surface
 POINT_DEPTH = 0.3  # deviations that points of a scan lie inside, so that a thin sheet has an inside
@@ -87,6 +88,8 @@ class ScanProblem:
     samples: int  # on each ray, at which its least value is sought
     moves: bool = True  # whether the placement is unknown
     code_deviation: float = CODE_DEVIATION
+    effective_rays: float = EFFECTIVE_RAYS
+    margin: float = MARGIN
     evaluations: Counter[int] = field(default_factory=Counter)  # of the field, by each start
 
     def retract(self, states: Sequence[PlacedCode], steps: Sequence[Tensor]) -> list[PlacedCode]:
@@ -119,48 +122,32 @@ class ScanProblem:
         if not count:
             return [(sample.points[:0], 0)] * len(states)
         rays = [state.place.rays_in_object(sample.rays) for state in states]
-        origins = torch.stack([each.origins for each in rays])
-        directions = torch.stack([each.directions for each in rays])
-        scale = torch.stack([state.place.scale for state in states])[:, None]
-        bounds = meet_sphere(Rays(origins, directions))
-        far = bounds.far.minimum((sample.until - self.deviation) / scale)
-        meets = bounds.near < far
-        near, far = (edge.masked_fill(~meets, 0.0) for edge in (bounds.near, far))
-        width = (far - near) / self.samples
-        steps = torch.arange(self.samples).to(near) + 0.5
-        t = near[..., None] + width[..., None] * steps
-        least, where = field(origins[:, :, None] + t[..., None] * directions[:, :, None]).min(dim=2)
-        t = t.gather(2, where[..., None])[..., 0]
-        refined = self._refine(field, Rays(origins, directions), t, least, width, meets)
-        is_free = torch.arange(count, device=t.device) < sample.free
-        wrong = meets & torch.where(is_free, least * scale < MARGIN * self.deviation, least > 0)
-        at = origins + t[..., None] * directions
-        for state, more in zip(states, refined, strict=True):
-            self.evaluations[state.start] += count * self.samples + more
-        free = (wrong & is_free).sum(1).tolist()
-        return [(state.place.to_world(at[k, wrong[k]]), free[k]) for k, state in enumerate(states)]
-
-    def _refine(
-        self, field: BatchField, rays: Rays, t: Tensor, least: Tensor, width: Tensor, meets: Bool[Tensor, "starts n"]
-    ) -> list[int]:
-        """Looks between the samples of rays on which something may be there; moves `t` and `least`.
-
-        Returns the evaluations of each start.
-        """
-        is_near = meets & (least.abs() < width)
-        evaluations = (FINE_SAMPLES * is_near.sum(1)).tolist()
-        start, ray = is_near.nonzero(as_tuple=True)
-        if not len(start):
-            return evaluations
-        offsets = torch.linspace(-0.5, 0.5, FINE_SAMPLES).to(t) * (1 - 1 / FINE_SAMPLES)
-        along = t[start, ray][None] + width[start, ray] * offsets[:, None]
-        some = rays[start, ray]
-        values, where = field.select(start)(some.origins + along[..., None] * some.directions).min(dim=0)
-        better = values < least[start, ray]
-        start, ray = start[better], ray[better]
-        t[start, ray] = along.gather(0, where[None])[0, better]
-        least[start, ray] = values[better]
-        return evaluations
+        scale = torch.stack([state.place.scale for state in states])
+        bounds = [meet_sphere(each) for each in rays]
+        near = torch.stack([each.near for each in bounds])
+        far = torch.stack([each.far for each in bounds]).minimum((sample.until - self.deviation) / scale[:, None])
+        start, ray = (near < far).nonzero(as_tuple=True)
+        at = torch.stack([each.origins for each in rays])[start, ray]
+        direction = torch.stack([each.directions for each in rays])[start, ray]
+        width = (far - near)[start, ray] / self.samples
+        steps = torch.arange(self.samples).to(near)[:, None] + 0.5
+        t, least = _least(field.select(start), Rays(at, direction), near[start, ray] + width * steps)
+        is_near = least.abs() < width
+        offsets = torch.linspace(-0.5, 0.5, FINE_SAMPLES).to(t)[:, None] * (1 - 1 / FINE_SAMPLES)
+        fine = t[is_near] + width[is_near] * offsets
+        fine_t, fine_least = _least(field.select(start[is_near]), Rays(at, direction)[is_near], fine)
+        t[is_near] = torch.where(fine_least < least[is_near], fine_t, t[is_near])
+        least[is_near] = fine_least.minimum(least[is_near])
+        is_free = ray < sample.free
+        depth = torch.where(is_free, least, -least) * scale[start]
+        wrong = torch.where(is_free, depth < self.margin * self.deviation, depth < 0)
+        found = at + t[:, None] * direction
+        parts = []
+        for k, state in enumerate(states):
+            mine = start == k
+            self.evaluations[state.start] += self.samples * int(mine.sum()) + FINE_SAMPLES * int((mine & is_near).sum())
+            parts.append((state.place.to_world(found[mine & wrong]), int((mine & wrong & is_free).sum())))
+        return parts
 
     def _residuals(self, state: PlacedCode, code: Tensor, wrong: tuple[Tensor, int]) -> Residuals:
         place = state.place
@@ -177,9 +164,9 @@ class ScanProblem:
             by_place[:, 6] += values * factor  # the residual is in the scan's unit
             jacobian = torch.cat([jacobian, by_place], dim=1)
         weights = values.new_full((len(values),), EFFECTIVE_POINTS / max(len(sample.points), 1))
-        weights[len(sample.points) :] = EFFECTIVE_RAYS / max(len(sample.until), 1)
+        weights[len(sample.points) :] = self.effective_rays / max(len(sample.until), 1)
         off = values * factor
-        off[len(sample.points) : len(sample.points) + free] -= MARGIN
+        off[len(sample.points) : len(sample.points) + free] -= self.margin
         if self.moves:
             off[: len(sample.points)] += POINT_DEPTH
         if sample.distances is not None:
@@ -229,3 +216,9 @@ def extended(
     beyond: Bool[Tensor, "n 1"] = length > 1
     across = (gradient - (gradient * within).sum(-1, keepdim=True) * within) / length + within
     return values + (length - 1)[:, 0], torch.where(beyond, across, gradient), by_code
+
+
+def _least(field: SDF, rays: Rays, t: Float[Tensor, "samples n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """Returns where on each ray, of given distances, the field is least, and its value."""
+    values, where = field(rays.origins + t[..., None] * rays.directions).min(dim=0)
+    return t.gather(0, where[None])[0], values

@@ -48,7 +48,7 @@ class ComparisonConfig:
     def __post_init__(self) -> None:
         if self.rays < 1 or self.neighbours < 1:
             given = f"{self.rays} rays and {self.neighbours} neighbours"
-            raise ValueError(f"{given} were asked for; both must be at least 1")
+            raise ValueError(f"{given} were given; both must be at least 1")
 
 
 @dataclass(frozen=True)
