@@ -25,7 +25,7 @@ HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=0.1, even=True, settled=0.0)
 CODE_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
-EFFECTIVE_RAYS = 4000.0  # what all rays count together: an exact silhouette says more than 100 depths
+EFFECTIVE_RAYS = 4000.0  # what all rays of an exact silhouette count together; less where there are few
 MARGINS = (0.7, 0.25)  # deviations that a free ray keeps from the surface, in the rough round and in the last one
 ROUGH = 3.0  # × the deviation, in the first round
 
@@ -194,7 +194,7 @@ def minimised(
             samples=stage.samples,
             moves=False,
             code_deviation=CODE_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
-            effective_rays=EFFECTIVE_RAYS,
+            effective_rays=EFFECTIVE_RAYS * min(1.0, len(sample.until) / max(stage.rays, 1)),
             margin=MARGINS[stage.deviation == config.deviation],
         )
 
