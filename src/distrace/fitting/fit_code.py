@@ -14,7 +14,7 @@ from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
 from distrace.fitting.ray_sampling import Targets, drawn, pools_of
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
-from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample
+from distrace.fitting.scan_residuals import MARGIN, PlacedCode, ScanProblem, ScanSample
 from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
@@ -24,9 +24,9 @@ from distrace.rays import Rays
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=0.1, even=True, settled=0.0)
-CODE_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
-EFFECTIVE_RAYS = 4000.0  # what all rays of an exact silhouette count together; less where there are few
-MARGINS = (0.7, 0.25)  # deviations that a free ray keeps from the surface, in the rough round and in the last one
+MEAN_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
+SILHOUETTE_RAYS = 4000.0  # what all rays of an exact silhouette count together; less where there are few
+LAST_MARGIN = 0.25  # deviations that a free ray keeps from the surface in the last round
 ROUGH = 3.0  # × the deviation, in the first round
 
 
@@ -52,10 +52,26 @@ class CodeFitConfig:
         """The rounds, the last of which is never empty."""
         first = self.iterations * 3 // 8
         every = 1 << 20  # dimensions: all that the prior has
-        some = (self.points // 5, self.rays // 3, SAMPLES, ROUGH * self.deviation, charbonnier)
-        many = (self.points, self.rays, SAMPLES, self.deviation, charbonnier)
-        rough = Round(self.starts, first, every, *some)
-        fine = Round(self.finalists, self.iterations - first, every, *many)
+        fine = Round(
+            self.finalists,
+            self.iterations - first,
+            every,
+            self.points,
+            self.rays,
+            SAMPLES,
+            self.deviation,
+            charbonnier,
+            LAST_MARGIN,
+        )
+        rough = replace(
+            fine,
+            starts=self.starts,
+            iterations=first,
+            points=self.points // 5,
+            rays=self.rays // 3,
+            deviation=ROUGH * self.deviation,
+            margin=MARGIN,
+        )
         return (rough, fine) if first else (fine,)
 
     @property
@@ -193,9 +209,9 @@ def minimised(
             tilt=0.0,
             samples=stage.samples,
             moves=False,
-            code_deviation=CODE_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
-            effective_rays=EFFECTIVE_RAYS * min(1.0, len(sample.until) / max(stage.rays, 1)),
-            margin=MARGINS[stage.deviation == config.deviation],
+            code_deviation=MEAN_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
+            effective_rays=SILHOUETTE_RAYS * min(1.0, len(sample.until) / max(stage.rays, 1)),
+            margin=stage.margin,
         )
 
     return run_rounds(states, config.rounds, problem_of, SOLVER, progress)

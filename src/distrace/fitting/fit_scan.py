@@ -78,7 +78,9 @@ def fit_scan(
     def problem_of(stage: Round) -> ScanProblem:
         sample = ScanSample.drawn(scan, stage.points, stage.rays, random)
         deviation = (stage.deviation**2 * scan.radius**2 + scan.noise**2) ** 0.5
-        return ScanProblem(quick, prior, sample, deviation, starts, scan.tilt, stage.samples, place is None)
+        return ScanProblem(
+            quick, prior, sample, deviation, starts, scan.tilt, stage.samples, place is None, margin=stage.margin
+        )
 
     ends = run_rounds(states, config.rounds, problem_of, SOLVER, progress)
     return _fitted(decoder, scan, prior, ends, began)

@@ -6,7 +6,7 @@ from math import inf
 
 from torch.nn.functional import pad
 
-from distrace.fitting.scan_residuals import PlacedCode, ScanProblem
+from distrace.fitting.scan_residuals import MARGIN, PlacedCode, ScanProblem
 from distrace.fitting.solver import Descent, Kernel, SolverConfig, cauchy, descend
 
 Progress = Callable[[int], None]
@@ -25,6 +25,7 @@ class Round:
     samples: int  # on each ray, at which its least value is sought
     deviation: float  # of the shape from the observation, in its unit
     kernel: Kernel = cauchy
+    margin: float = MARGIN  # deviations that a free ray keeps from the surface
 
 
 @dataclass(frozen=True)

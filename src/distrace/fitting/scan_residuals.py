@@ -5,12 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from distrace.data.scan import Scan
 from distrace.fields.base import SDF
-from distrace.fields.batch import BatchField
+from distrace.fields.batch import BatchField, Selection
 from distrace.fields.decoder import FAR, Decoder
 from distrace.fields.precision import BFloat16Decoder
 from distrace.fitting.code_jacobian import SMALL, derivatives
@@ -131,13 +131,11 @@ class ScanProblem:
         direction = torch.stack([each.directions for each in rays])[start, ray]
         width = (far - near)[start, ray] / self.samples
         steps = torch.arange(self.samples).to(near)[:, None] + 0.5
-        t, least = _least(field.select(start), Rays(at, direction), near[start, ray] + width * steps)
+        along = Rays(at, direction)
+        values = field.select(start)
+        t, least = _least(values, along, near[start, ray] + width * steps)
         is_near = least.abs() < width
-        offsets = torch.linspace(-0.5, 0.5, FINE_SAMPLES).to(t)[:, None] * (1 - 1 / FINE_SAMPLES)
-        fine = t[is_near] + width[is_near] * offsets
-        fine_t, fine_least = _least(field.select(start[is_near]), Rays(at, direction)[is_near], fine)
-        t[is_near] = torch.where(fine_least < least[is_near], fine_t, t[is_near])
-        least[is_near] = fine_least.minimum(least[is_near])
+        _refine(values, along, width, is_near.nonzero()[:, 0], t, least)
         is_free = ray < sample.free
         depth = torch.where(is_free, least, -least) * scale[start]
         wrong = torch.where(is_free, depth < self.margin * self.deviation, depth < 0)
@@ -222,3 +220,11 @@ def _least(field: SDF, rays: Rays, t: Float[Tensor, "samples n"]) -> tuple[Float
     """Returns where on each ray, of given distances, the field is least, and its value."""
     values, where = field(rays.origins + t[..., None] * rays.directions).min(dim=0)
     return t.gather(0, where[None])[0], values
+
+
+def _refine(field: Selection, rays: Rays, width: Tensor, near: Int[Tensor, "m"], t: Tensor, least: Tensor) -> None:
+    """Looks between the samples of rays `near` the surface, which are `width` apart; lowers `least` and moves `t`."""
+    offsets = torch.linspace(-0.5, 0.5, FINE_SAMPLES).to(t)[:, None] * (1 - 1 / FINE_SAMPLES)
+    found, values = _least(field.at_rows(near), rays[near], t[near] + width[near] * offsets)
+    t[near] = torch.where(values < least[near], found, t[near])
+    least[near] = values.minimum(least[near])
