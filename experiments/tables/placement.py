@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from distrace.data.scan import scan_of_view
-from distrace.data.solid import Solid, normalised, solid_of
+from distrace.data.solid import Solid, normalised, normalised_frame, solid_of
 from distrace.data.up import Up
 from distrace.files import save_json
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
@@ -111,8 +111,9 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     scan = scan_of_view(scene.view, scene.mask, Up.along("y"))
     known = scene.place if trial.told else None
     fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known)
-    degrees, size, centre = placement_error(fit.place, scene.place, symmetric_turns(place.meshes, trial))
     mesh = extract_mesh(place.field_of(trial.category, fit.code), place.mesh)
+    found = by_extent(mesh, fit.place)
+    degrees, size, centre = placement_error(found, scene.place, symmetric_turns(place.meshes, trial))
     result = Placed(
         trial,
         degrees,
@@ -164,6 +165,13 @@ def placement_error(
     size = 100 * abs(float(found.scale / true.scale) - 1)
     centre = 100 * float((found.translation - true.translation).norm() / (2 * true.scale))
     return math.degrees(min(apart)), size, centre
+
+
+def by_extent(mesh: trimesh.Trimesh, place: Similarity) -> Similarity:
+    """Returns where an object is by its own extents, as those of true shapes: a code's may be less than the sphere."""
+    middle, scale = normalised_frame(mesh)
+    centre = place.to_world(torch.from_numpy(middle).float())
+    return Similarity(place.rotation, centre, place.scale / float(scale))
 
 
 def in_true_frame(mesh: trimesh.Trimesh, found: Similarity, scene: Scene) -> trimesh.Trimesh:

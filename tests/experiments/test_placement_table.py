@@ -15,6 +15,7 @@ from experiments.datasets.sensor import sensed
 from experiments.tables.placement import (
     Placed,
     PlacedTrial,
+    by_extent,
     placement_error,
     placement_rows,
     placement_trials,
@@ -53,6 +54,17 @@ def test_errors_are_those_of_the_nearest_equal_turn() -> None:
     assert size == pytest.approx(10, abs=0.01)
     assert centre == pytest.approx(3, abs=0.01)
     assert placement_error(found, true, [turn_about_y(0)])[0] == pytest.approx(177, abs=0.05)
+
+
+def test_an_object_that_fills_half_of_the_sphere_is_as_large_as_it_is() -> None:
+    true = Similarity(roma.random_rotmat(), torch.tensor([1.0, 2.0, 3.0]), torch.tensor(0.5))
+    mesh = normalised(trimesh.creation.box((1.0, 0.6, 0.8)))
+    half = mesh.copy().apply_scale(0.5).apply_translation((0.1, 0.0, 0.0))
+    shift = true.turned(torch.tensor([0.1, 0.0, 0.0]))
+    latent = Similarity(true.rotation, true.translation - shift, true.scale * 2)
+    found = by_extent(half, latent)
+    assert max(placement_error(found, true, [turn_about_y(0)])[1:]) < 0.01
+    assert placement_error(latent, true, [turn_about_y(0)])[1] == pytest.approx(100)
 
 
 def result(shape: str, told: bool, chamfer: float, degrees: float, verdict: str) -> Placed:
