@@ -1,18 +1,21 @@
 """The table of completions of other people's scans, whose placement and true shape nobody knows."""
 
-import json
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import tyro
 
-from distrace.cli.common import opened, show_table
-from distrace.cli.console import console, origin, start
-from distrace.cli.scan_completion import ScanTask, complete_scan
+from distrace.checkpoints.model import load_model
+from distrace.cli.common import save_code, save_completed, show_table
+from distrace.cli.console import origin, progress, start
 from distrace.data.scan_files import ScanOptions, load_scan
-from distrace.mesh import MeshConfig
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.prior import prior_of
+from distrace.processes import each_done
+from experiments.commands.depth import checked
 
 CHAIR = (360, 120, 570, 480)  # left, top, right, bottom of the chair in the depth image of the first frame
 FRAMES = ("000090", "000000", "000030", "000060", "000120")
@@ -34,39 +37,48 @@ class RealScans:
     """Complete a chair from one depth image of a real kitchen and from five, and four partial clouds."""
 
     data: tyro.conf.Positional[Path]  # a folder with kitchen_rgbd (7-Scenes) and partial_clouds (PCN, PoinTr)
-    out: Path = Path("out/real-scans")  # with a folder as `complete` writes it for each input
-    resolution: int = 128
+    out: Path = Path("out/real-scans")  # with a folder of each input: mesh, code and placement
+    resolution: int = 128  # of the meshes
     seed: int = 0
+    jobs: int = 1  # processes; times are those of one at a time
 
     def run(self) -> None:
+        checked(self.jobs, None)
         run = start(self.out)
+        given = list(inputs(self.data))
+        work = partial(completed, run.out, self.resolution, self.seed)
         rows = []
-        for each in inputs(self.data):
-            console.print(f"{each.name}, by {each.model}")
-            rows.append(self._row(each))
+        with progress("real scans", len(given)) as bar:
+            for row in map(work, given) if self.jobs == 1 else each_done(work, given, self.jobs):
+                rows.append(row)
+                bar.advance(f"{row['input']}: {row['verdict']}")
+        names = [each.name for each in given]
+        rows.sort(key=lambda row: names.index(row["input"]))
         show_table(rows)
         run.finish({"rows": rows, "evaluations": sum(row["evaluations"] for row in rows), **origin()})
 
-    def _row(self, given: Input) -> dict:
-        """Completes an input, and returns what its `result.json` says."""
-        run = start(self.out / given.name)
-        began = time.process_time()
-        with run.noticing():
-            scan = load_scan(given.paths, given.options)
-            model = opened(given.model, run.device)
-            complete_scan(run, ScanTask(model, scan, None, MeshConfig(self.resolution), self.seed))
-        facts = json.loads((run.out / "result.json").read_text())
-        return {
-            "input": given.name,
-            "model": given.model,
-            "verdict": facts["verdict"],
-            "explained": facts["explained"],
-            "blocked": facts["free_space_violated"],
-            "seen": facts["extent_seen"],
-            "seconds": round(facts["seconds"], 1),
-            "processor_seconds": round(time.process_time() - began, 1),
-            "evaluations": facts["evaluations"],
-        }
+
+def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
+    """Completes an input, writes its mesh, and returns its row."""
+    scan = load_scan(given.paths, given.options)
+    model = load_model(given.model)
+    fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed))
+    mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
+    mesh.apply_transform(fit.place.T_world_object.double().numpy())
+    folder = start(out / given.name).out
+    save_code(folder, fit.code, fit.place)
+    save_completed(folder, mesh)
+    verdict = fit.verdict
+    return {
+        "input": given.name,
+        "model": given.model,
+        "verdict": verdict.name,
+        "explained": round(verdict.explained, 3),
+        "blocked": round(verdict.blocked, 3),
+        "seen": round(verdict.seen, 3),
+        "seconds": round(fit.seconds, 1),
+        "evaluations": fit.evaluations,
+    }
 
 
 def inputs(data: Path) -> Iterator[Input]:

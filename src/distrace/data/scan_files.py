@@ -40,16 +40,17 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
     """
     images = [path for path in paths if _kind(path) in KINDS]
     poses = _poses(images, options.poses)
-    scans = []
-    first: ObjectView | None = None
+    clouds = []
+    read = []
     for path in paths:
         if _kind(path) in CLOUDS:
-            _refuse(path, "is an image's", mask=options.mask, box=options.box)
-            _refuse(path, "is a depth image's", intrinsics=options.intrinsics)
-            scans.append(_scan_of_cloud(path, options.up))
-            continue
-        pose = poses.pop(0) if _kind(path) in KINDS else None
-        scene, mask, up = _read_image(path, pose, options)
+            clouds.append(_read_cloud(path, options))
+        else:
+            pose = poses.pop(0) if _kind(path) in KINDS else None
+            read.append((path, *_read_image(path, pose, options)))
+    scans = []
+    first: ObjectView | None = None
+    for path, scene, mask, up in read:
         with about(path):
             if first is None:
                 found = first = _find_first(scene, mask, options, up)
@@ -58,14 +59,11 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
             else:
                 found = find_again(first, scene)
         if found is None:
-            warnings.warn(
-                f"{path} shows hardly a point near the object of the first image, and is left out",
-                DoubtfulResult,
-                stacklevel=2,
-            )
+            sentence = f"{path} shows hardly a point near the object of the first image, and is left out"
+            warnings.warn(sentence, DoubtfulResult, stacklevel=2)
         else:
             scans.append(scan_of_object(found))
-    return joined(scans)
+    return joined([*scans, *clouds])
 
 
 def _poses(images: Sequence[Path], poses: Sequence[Path]) -> list[Path | None]:
@@ -98,10 +96,12 @@ def _read_image(path: Path, pose: Path | None, options: ScanOptions) -> tuple[Vi
     return View(camera, depth), None, up
 
 
-def _scan_of_cloud(path: Path, up: str | None) -> Scan:
+def _read_cloud(path: Path, options: ScanOptions) -> Scan:
+    _refuse(path, "is a depth image's", intrinsics=options.intrinsics)
+    _refuse(path, "is an image's", mask=options.mask, box=options.box)
     points = torch.from_numpy(read_points(path)).float()
     with about(path):
-        return scan_of_points(points, Up.along(up or "y"))
+        return scan_of_points(points, Up.along(options.up or "y"))
 
 
 def _kind(path: Path) -> str:
