@@ -8,6 +8,7 @@ from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
 from experiments.commands.placement import Placement
 from experiments.commands.procedural import Procedural
+from experiments.commands.real_scans import RealScans
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
 from experiments.commands.training_data import Card, Choices, Splits
 from experiments.commands.views import Views
@@ -28,6 +29,7 @@ COMMANDS = {
     "spread": Spread,
     "pose": Pose,
     "placement": Placement,
+    "real-scans": RealScans,
     "multiview": Multiview,
     "photographs": Photographs,
     "foreign-models": ForeignModels,

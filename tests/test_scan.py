@@ -12,7 +12,8 @@ from PIL import Image
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
-from distrace.data.scan import Scan, ScanOptions, canonical_scan, joined, load_scan, scan_of_points, scan_of_view
+from distrace.data.scan import Scan, canonical_scan, joined, scan_of_points, scan_of_view
+from distrace.data.scan_files import ScanOptions, load_scan
 from distrace.data.up import Up
 from distrace.errors import DoubtfulResult
 from distrace.files import save_arrays
@@ -22,11 +23,9 @@ RADIUS = 0.4
 HEIGHT = 96
 
 
-def room(pitch: float = 25.0) -> tuple[View, torch.Tensor]:
+def room(pitch: float = 25.0, azimuth: float = 0.0) -> tuple[View, torch.Tensor]:
     """A ball on a floor, a wall behind it, and a second, smaller ball beside it; with the mask of the first ball."""
-    angle = math.radians(pitch)
-    eye = torch.tensor([0.0, 2.2 * math.sin(angle), 2.2 * math.cos(angle)])
-    camera = Camera.look_at(eye, torch.zeros(3), height=HEIGHT, width=HEIGHT, focal_px=100.0)
+    camera = Camera.orbit(azimuth, pitch, 2.2, height=HEIGHT, width=HEIGHT, focal_px=100.0)
     rays = camera.rays()
     ball = meet_sphere(rays, RADIUS).near
     moved = type(rays)(rays.origins - torch.tensor([0.7, -0.25, 0.0]), rays.directions)
@@ -102,7 +101,7 @@ def test_nothing_is_below_the_floor() -> None:
 def test_the_floor_tells_up_in_a_cameras_frame(pitch: float) -> None:
     scene, mask = room(pitch)
     here = View(Camera(scene.camera.intrinsics, torch.eye(4), HEIGHT, HEIGHT), scene.depth)
-    scan = scan_of_view(here, mask, Up.of_camera())
+    scan = scan_of_view(here, mask, Up.of_camera(torch.eye(3)))
     true_up = scene.camera.T_world_camera[:3, :3].T @ torch.tensor([0.0, 1.0, 0.0])
     assert len(scan.ups) == 1
     assert float(scan.ups[0] @ true_up) > math.cos(math.radians(2))
@@ -110,7 +109,7 @@ def test_the_floor_tells_up_in_a_cameras_frame(pitch: float) -> None:
 
 def test_without_a_floor_a_camera_may_look_down() -> None:
     scene, mask = room()
-    ups = scan_of_view(scene.masked(mask), mask, Up.of_camera()).ups
+    ups = scan_of_view(scene.masked(mask), mask, Up.of_camera(torch.eye(3))).ups
     assert len(ups) == 3
     torch.testing.assert_close(ups[0], torch.tensor([0.0, -1.0, 0.0]))
     torch.testing.assert_close(ups.norm(dim=-1), torch.ones(3))

@@ -17,7 +17,7 @@ from distrace import metrics
 from distrace.checkpoints.model import load_model
 from distrace.mesh import MeshConfig
 from experiments.__main__ import main
-from experiments.commands import depth
+from experiments.commands import depth, real_scans
 from experiments.datasets.splits import FOLDER
 from experiments.fields.analytic import NAMES
 from experiments.tables import completion, sparse_depth, spread, training_choices
@@ -174,6 +174,20 @@ def test_splits_and_card_describe_what_a_model_was_trained_on(
     assert "| held | held out | me | CC0-1.0 |" in said
 
 
+def test_real_scans_have_a_row_and_a_folder_each(
+    model: Path, run: Command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    trimesh.creation.icosphere(subdivisions=3, radius=1.2).export(tmp_path / "ball.ply")
+    given = real_scans.Input("ball", str(model), (tmp_path / "ball.ply",))
+    monkeypatch.setattr(real_scans, "inputs", lambda data: [given])
+    run("real-scans", tmp_path, "--resolution", 16, "--out", tmp_path / "out")
+    (row,) = result(tmp_path / "out", "rows", "evaluations", "command", "machine")["rows"]
+    assert (row["input"], row["verdict"]) == ("ball", "trusted")
+    assert row["explained"] > 0.9
+    assert row["evaluations"] > 1000
+    assert {"mesh.ply", "mesh.glb", "code.npy", "placement.json"} == names(tmp_path / "out" / "ball")
+
+
 @pytest.mark.slow
 def test_choices_trains_small_networks(
     spheres_split: tuple[Path, Path],
@@ -222,6 +236,7 @@ BAD = [
     ("sparse-depth --classes {tmp}/missing", "there is no split"),
     ("splits --splits {tmp}/missing", "there is no split"),
     ("splits --meshes {tmp}/missing", "is missing; `distrace data furniture"),
+    ("real-scans {tmp}/missing", "frame-000090.depth.png does not exist"),
     ("card --model {tmp}/missing --split sofas", "neither a folder nor a bundled model"),
     ("choices --samples {tmp}/missing", "holds no samples of chairs"),
 ]

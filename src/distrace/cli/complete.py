@@ -16,7 +16,7 @@ from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
-from distrace.data.scan import CLOUDS, ScanOptions, load_scan
+from distrace.data.scan_files import CLOUDS, ScanOptions, load_scan
 from distrace.errors import explained
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
@@ -38,22 +38,26 @@ Axis = Literal["x", "y", "z", "-x", "-y", "-z", "unknown"]
 class Complete:
     """Complete a shape from a depth image, an observation or a point cloud, wherever the object is.
 
-    Writes the mesh, the placement, the code, a verdict, and a page that shows them beside the input.
+    Writes the mesh, the placement, the code, a verdict, and a page that shows them beside the input. Several images
+    show one object in one world; --mask or --box marks it in the first.
     """
 
     model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
     inputs: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT …", help_behavior_hint="(required)")]
     ]
-    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world"""
+    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world:
+    depth images with --poses"""
     out: Path = Path("out/complete")
     up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
     """axis of the input's frame that points up, or `unknown`"""
     intrinsics: Annotated[str | None, default("none", "K")] = None
     """of a depth image: fx,fy,cx,cy in pixels, or a file with a 3 × 3 matrix"""
-    mask: Annotated[Path | None, default("none", "PNG")] = None  # white where the object is
+    poses: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="POSE …", help_behavior_hint="(default: none)")] = ()
+    """of each depth image: a file with the 4 × 4 matrix that maps its camera to the world, whose frame is then used"""
+    mask: Annotated[Path | None, default("none", "PNG")] = None  # of the first image: white where the object is
     box: Annotated[tuple[int, int, int, int] | None, default("none", "LEFT TOP RIGHT BOTTOM")] = None
-    """rectangle around the object, in pixels; the floor and separate things in it are left out"""
+    """of the first image: pixels around the object; the floor and separate things in it are left out"""
     frame: Annotated[Literal["input", "canonical"] | None, default("canonical where an input says so", "FRAME")] = None
     """canonical: the object lies in the unit sphere, upright, turned as its class is"""
     reference: Annotated[Path | None, default("none", "PLY")] = None
@@ -88,7 +92,7 @@ class Complete:
 
     def _refuse(self, frame: str) -> None:
         """Raises `ValueError` for options of the other frame, which would do nothing."""
-        names = ("up", "intrinsics", "mask", "box")
+        names = ("up", "intrinsics", "poses", "mask", "box")
         if frame == "input":
             names = ("ignore", "solver", "iterations", "starts", "plausible")
         for name in names:
@@ -96,7 +100,7 @@ class Complete:
                 raise ValueError(f"--{name} was given, which --frame {frame} does not use; leave it out")
 
     def _placed(self, run: Run, mesh: MeshConfig) -> Verdict:
-        scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box))
+        scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box, self.poses))
         scan = scan if self.points is None else scan.sparse(self.points, self.seed)
         truth = None if self.reference is None else _reference(self.reference)
         return complete_scan(run, ScanTask(opened(self.model, run.device), scan, truth, mesh, self.seed))

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -11,6 +12,7 @@ from distrace.camera import Camera
 from distrace.data.arrays import camera_of, depth_image, mask_image
 from distrace.errors import about, explained
 from distrace.optional import require
+from distrace.viewpoint import check_matrices
 
 KINDS = (".png", ".npy", ".exr", ".tif", ".tiff")
 MILLIMETRES = 1e-3
@@ -48,6 +50,19 @@ def load_intrinsics(text: str, height: int, width: int) -> Camera:
         matrix = _matrix(text)
     with about(f"--intrinsics {text}"):
         return camera_of(matrix, np.eye(4), height, width)
+
+
+def load_pose(path: Path) -> Float[Tensor, "4 4"]:
+    """Returns the matrix that maps camera axes to the world, from a text file or NPY; lengths are in metres.
+
+    Raises `ValueError`, in one sentence, for anything that is no rigid motion.
+    """
+    with explained(f"{path} cannot be read as a pose: give the 4 × 4 matrix that maps its camera to the world", path):
+        values = np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else _numbers_of(path.read_text())
+        pose = torch.from_numpy(values.reshape(4, 4)).float()
+    with about(path):
+        check_matrices(torch.eye(3), pose)
+    return pose
 
 
 def load_mask(path: Path, height: int, width: int) -> Bool[Tensor, "height width"]:
@@ -104,7 +119,7 @@ def _matrix(text: str) -> np.ndarray:
         return np.load(path, allow_pickle=False)
     content = path.read_text()
     if path.suffix.lower() != ".json":
-        return np.array(content.replace(",", " ").split(), dtype=np.float64).reshape(3, 3)
+        return _numbers_of(content).reshape(3, 3)
     found = json.loads(content)
     if isinstance(found, dict) and "fx" in found:
         return np.array([[found["fx"], 0, found["cx"]], [0, found["fy"], found["cy"]], [0, 0, 1]])
@@ -113,3 +128,7 @@ def _matrix(text: str) -> np.ndarray:
     if isinstance(found, dict):
         raise ValueError(f"it holds {', '.join(found)}")
     return np.asarray(found, dtype=np.float64).reshape(3, 3)
+
+
+def _numbers_of(text: str) -> np.ndarray:
+    return np.array(text.replace(",", " ").split(), dtype=np.float64)

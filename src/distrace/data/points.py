@@ -61,9 +61,11 @@ def object_points(points: Float[Tensor, "n 3"], floor: "Floor | None", share: fl
     is_main = (counts >= share * counts.max())[pieces]
     main = candidates[is_main]
     gap = PIECE_GAP * float((main.amax(0) - main.amin(0)).max())
-    away, _ = KDTree(main.double().numpy()).query(candidates.double().numpy())
+    away = torch.zeros(len(candidates), dtype=torch.float64)
+    distances, _ = KDTree(main.double().numpy()).query(candidates[~is_main].double().numpy())
+    away[~is_main] = torch.from_numpy(distances)
     nearest = torch.full((len(counts),), torch.inf, dtype=torch.float64)
-    nearest.scatter_reduce_(0, pieces, torch.from_numpy(away), "amin")
+    nearest.scatter_reduce_(0, pieces, away, "amin")
     kept[kept.clone()] = nearest[pieces] <= gap
     return kept
 

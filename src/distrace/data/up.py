@@ -39,10 +39,13 @@ class Up:
         return Up(direction, direction[None], GIVEN_TILT)
 
     @staticmethod
-    def of_camera() -> "Up":
-        """Returns what is likely in a camera's frame, whose y points down: cameras look level, or down."""
+    def of_camera(rotation: Float[Tensor, "3 3"]) -> "Up":
+        """Returns what is likely for a camera, whose y points down: cameras look level, or down.
+
+        `rotation` takes the camera's axes to those of the world.
+        """
         pitches = torch.deg2rad(torch.tensor(PITCHES))
-        candidates = torch.stack([torch.zeros(len(PITCHES)), -pitches.cos(), -pitches.sin()], dim=1)
+        candidates = torch.stack([torch.zeros(len(PITCHES)), -pitches.cos(), -pitches.sin()], dim=1) @ rotation.T
         return Up(candidates[0], candidates, PITCHED_TILT)
 
 

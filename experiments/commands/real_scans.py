@@ -1,0 +1,94 @@
+"""The table of completions of other people's scans, whose placement and true shape nobody knows."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import tyro
+
+from distrace.checkpoints.model import load_model
+from distrace.cli.common import save_code, save_completed, show_table
+from distrace.cli.console import origin, progress, start
+from distrace.data.scan_files import ScanOptions, load_scan
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.prior import prior_of
+from distrace.processes import each_done
+from experiments.commands.depth import checked
+
+CHAIR = (360, 120, 570, 480)  # left, top, right, bottom of the chair in the depth image of the first frame
+FRAMES = ("000090", "000000", "000030", "000060", "000120")
+CLOUDS = {"pcn_airplane": "planes", "pcn_chair": "chairs", "pointr_airplane": "planes", "pointr_sofa": "sofas"}
+
+
+@dataclass(frozen=True)
+class Input:
+    """Files of one object, and what a user says about them."""
+
+    name: str
+    model: str
+    paths: tuple[Path, ...]
+    options: ScanOptions = ScanOptions()
+
+
+@dataclass(frozen=True)
+class RealScans:
+    """Complete a chair from one depth image of a real kitchen and from five, and four partial clouds."""
+
+    data: tyro.conf.Positional[Path]  # a folder with kitchen_rgbd (7-Scenes) and partial_clouds (PCN, PoinTr)
+    out: Path = Path("out/real-scans")  # with a folder of each input: mesh, code and placement
+    resolution: int = 128  # of the meshes
+    seed: int = 0
+    jobs: int = 1  # processes; times are those of one at a time
+
+    def run(self) -> None:
+        checked(self.jobs, None)
+        run = start(self.out)
+        given = list(inputs(self.data))
+        work = partial(completed, run.out, self.resolution, self.seed)
+        rows = []
+        with progress("real scans", len(given)) as bar:
+            for row in map(work, given) if self.jobs == 1 else each_done(work, given, self.jobs):
+                rows.append(row)
+                bar.advance(f"{row['input']}: {row['verdict']}")
+        names = [each.name for each in given]
+        rows.sort(key=lambda row: names.index(row["input"]))
+        show_table(rows)
+        run.finish({"rows": rows, "evaluations": sum(row["evaluations"] for row in rows), **origin()})
+
+
+def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
+    """Completes an input, writes its mesh, and returns its row."""
+    scan = load_scan(given.paths, given.options)
+    model = load_model(given.model)
+    fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed))
+    mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
+    mesh.apply_transform(fit.place.T_world_object.double().numpy())
+    folder = start(out / given.name).out
+    save_code(folder, fit.code, fit.place)
+    save_completed(folder, mesh)
+    verdict = fit.verdict
+    return {
+        "input": given.name,
+        "model": given.model,
+        "verdict": verdict.name,
+        "explained": round(verdict.explained, 3),
+        "blocked": round(verdict.blocked, 3),
+        "seen": round(verdict.seen, 3),
+        "seconds": round(fit.seconds, 1),
+        "evaluations": fit.evaluations,
+    }
+
+
+def inputs(data: Path) -> Iterator[Input]:
+    """Returns the inputs. The box about the chair was read off the image; all clouds have y up, the default."""
+    kitchen = data / "kitchen_rgbd"
+    intrinsics = str(kitchen / "camera-intrinsics.txt")
+    for count in (1, len(FRAMES)):
+        images = tuple(kitchen / f"frame-{frame}.depth.png" for frame in FRAMES[:count])
+        poses = tuple(kitchen / f"frame-{frame}.pose.txt" for frame in FRAMES[:count])
+        name = "kitchen-chair" if count == 1 else f"kitchen-chair-{count}-images"
+        yield Input(name, "chairs", images, ScanOptions(intrinsics=intrinsics, box=CHAIR, poses=poses))
+    for name, model in CLOUDS.items():
+        yield Input(name, model, (data / "partial_clouds" / f"{name}.pcd",))
