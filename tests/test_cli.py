@@ -355,7 +355,7 @@ def test_mesh_says_what_is_doubtful_of_a_field(
 
 def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None:
     run("bench", "trace", model, "--code", 1, "--size", 16, "--repeats", 1, "--out", tmp_path)
-    assert names(tmp_path) == {"result.json", "evaluations.png", "index.html"}
+    assert names(tmp_path) == {"result.json", "evaluations.png"}
     facts = result(tmp_path, "rows", "command", "machine", "evaluations")
     assert facts["command"].startswith("distrace bench trace")
     columns = {"model", "strategy", "queries", "setup_queries", "seconds", "hits", "iou", "outliers"}
@@ -368,7 +368,7 @@ def test_bench_writes_a_table(model: Path, run: Command, tmp_path: Path) -> None
 def test_bench_views_writes_rows_a_summary_and_the_worst_views(model: Path, run: Command, tmp_path: Path) -> None:
     words = ("bench", "views", model, "--views", 3, "--sizes", 16, 24, "--seed", 5)
     run(*words, "--out", tmp_path / "first")
-    assert names(tmp_path / "first") == {"result.json", "worst.png", "index.html"}
+    assert names(tmp_path / "first") == {"result.json", "worst.png"}
     facts = result(tmp_path / "first", "rows", "summary", "command", "machine", "evaluations", "setup_evaluations")
     columns = {"model", "code", "camera", "pixels", "missed", "added", "iou", "largest_loss", "off", "evaluations"}
     assert all(columns | {"per_pixel", "exhausted", "seconds", "fails"} <= set(row) for row in facts["rows"])

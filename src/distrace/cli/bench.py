@@ -1,4 +1,4 @@
-"""`bench`: the tracer's cost and error, as JSON, as a page and in the terminal."""
+"""`bench`: the tracer's cost and error, as JSON and in the terminal."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -7,15 +7,15 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from distrace.benchmarks import ablation, pages
+from distrace.benchmarks import ablation
 from distrace.benchmarks.backward import timings
 from distrace.benchmarks.measuring import measure, poster_view
+from distrace.benchmarks.pictures import MAPPED, query_map
 from distrace.checking.gradcheck import check_gradients
 from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.common import default, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
-from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 
 HIDDEN = ("model", "share", "runs")  # columns that the terminal does not show
@@ -50,15 +50,13 @@ class Bench:
     sizes: tuple[int, int] = (128, 512)  # for `views`: the smallest and the largest image, in pixels along each side
     strategy: Annotated[str | None, default("fast", "STR")] = None  # for `views`: as in `distrace render`
     seed: int = 0  # for `views`
-    references: Annotated[Path | None, default("none", "PATH")] = None
-    """for `views`: a folder that caches references, which take most of the time"""
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         if self.what == "views":
             names = self.models or bundled_models()
-            bench_views(run, Plan(names, self.views, self.sizes, self.seed, self.strategy, self.references))
+            bench_views(run, Plan(names, self.views, self.sizes, self.seed, self.strategy))
         else:
             getattr(self, f"_{self.what}")(run, opened(self.model, run.device))
 
@@ -79,11 +77,8 @@ class Bench:
                 bar.advance(case.strategy)
         with progress("runs", len(cases) * (self.repeats + 1 if self.repeats > 1 else 1)) as bar:
             measured = measure(cases, self.repeats, bar.advance)
-        truths = [case.truth.cpu().numpy() for case in cases]
-        maps = {row.strategy: pages.query_map(buffers) for row, buffers in measured if row.strategy in pages.MAPPED}
-        save_png(run.out / "evaluations.png", side_by_side(list(maps.values())))
-        with run.optional("index.html"):
-            save_text(run.out / "index.html", pages.trace_page(self.model, measured, truths))
+        maps = [query_map(buffers) for row, buffers in measured if row.strategy in MAPPED]
+        save_png(run.out / "evaluations.png", side_by_side(maps))
         finish(run, rows_of(self.model, [row for row, _ in measured]))
 
     def _gradients(self, run: Run, model: Model) -> None:
@@ -104,8 +99,6 @@ class Bench:
             for row in found.rows
         ]
         times = timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
-        with run.optional("index.html"):
-            save_text(run.out / "index.html", pages.gradients_page(rows, times))
         timing = rows_of(self.model, times)
         show(rows)
         show(timing)
