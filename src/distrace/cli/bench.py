@@ -8,7 +8,6 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from distrace.benchmarks import ablation
-from distrace.benchmarks.backward import timings
 from distrace.benchmarks.measuring import measure, poster_view
 from distrace.benchmarks.pictures import MAPPED, query_map
 from distrace.checking.gradcheck import check_gradients
@@ -35,7 +34,7 @@ class Bench:
 
     what: tyro.conf.Positional[Literal["trace", "views", "gradients"]]
     """trace: every strategy on one view; views: the default tracer on random views; gradients: derivatives against
-    finite differences, and the time of a backward pass"""
+    finite differences"""
     models: tyro.conf.Positional[
         Annotated[
             tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]", help_behavior_hint="(default of `views`: all bundled)")
@@ -44,7 +43,7 @@ class Bench:
     """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, the others one"""
     out: Path = Path("out/bench")
     code: int = 0  # number of the training shape
-    size: int = 512  # pixels along each side, for `trace` and the times of `gradients`
+    size: int = 512  # pixels along each side, for `trace`; for `gradients` at most 48
     repeats: int = 5  # timed runs of each row, after a warm-up; a row that takes over a minute runs once
     views: int = 60  # for `views`: random views of each model
     sizes: tuple[int, int] = (128, 512)  # for `views`: the smallest and the largest image, in pixels along each side
@@ -98,11 +97,8 @@ class Bench:
             }
             for row in found.rows
         ]
-        times = timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
-        timing = rows_of(self.model, times)
         show(rows)
-        show(timing)
-        run.finish({"rows": rows, "timing": timing, **origin(), "evaluations": found.evaluations})
+        run.finish({"rows": rows, **origin(), "evaluations": found.evaluations})
 
 
 def rows_of(model: str, measured: Iterable[Any]) -> list[dict[str, Any]]:
