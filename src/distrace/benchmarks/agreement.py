@@ -103,11 +103,10 @@ def measure_view(
 
 def largest_part(mask: Bool[np.ndarray, "height width"]) -> int:
     """Returns the pixels of the largest part connected by edges or corners; 0 for an empty mask."""
-    from scipy import ndimage
+    from skimage.measure import label
 
-    labels = np.zeros(mask.shape, dtype=np.int32)
-    ndimage.label(mask, structure=np.ones((3, 3)), output=labels)
-    return int(np.bincount(labels.ravel())[1:].max(initial=0))
+    parts = np.asarray(label(mask, connectivity=2))
+    return int(np.bincount(parts.ravel())[1:].max(initial=0))
 
 
 def summaries(rows: Sequence[ViewRow]) -> list[Summary]:

@@ -208,14 +208,11 @@ def _spread(tests: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 
 def _quartered(triangles: np.ndarray) -> np.ndarray:
-    a = triangles[:, 0]
-    b = triangles[:, 1]
-    c = triangles[:, 2]
-    ab = (a + b) / 2
-    bc = (b + c) / 2
-    ca = (c + a) / 2
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
+    from trimesh.remesh import subdivide
+
+    corners = triangles.reshape(-1, 3)
+    vertices, faces, *_ = subdivide(corners, np.arange(len(corners)).reshape(-1, 3))
+    return vertices[faces]
 
 
 def _winding(soup: "trimesh.Trimesh", points: np.ndarray) -> np.ndarray:
