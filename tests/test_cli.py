@@ -149,9 +149,9 @@ def test_an_orbit_counts_all_its_frames_and_reuses_what_the_first_has_learnt(
     run("render", model, "--orbit", 3, "--clearance", "--out", tmp_path / "turn", *VIEW)
     facts = result(tmp_path / "turn", "frames", "evaluations_per_visible_pixel")
     assert facts["frames"] == 3
-    singly, placed = [], show.orbiting
+    singly, placed = [], show.Render.camera
     for k in range(3):  # as the orbit turns them: an azimuth of as much is off by rounding
-        monkeypatch.setattr(show, "orbiting", lambda view, turn=120 * k: placed(view).turned(turn))
+        monkeypatch.setattr(show.Render, "camera", lambda view, turn=120 * k: placed(view).turned(turn))
         singly.append(still_facts(model, run, tmp_path / str(k)))
     first, *others = singly
     assert facts["setup_evaluations"] == first["setup_evaluations"] > 0, "the lattice is built once"

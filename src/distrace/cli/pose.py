@@ -32,7 +32,7 @@ class Pose:
     --elevation and --distance.
     """
 
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    model: tyro.conf.Positional[ModelName]
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
     out: Path = Path("out/pose")
     code: str = "0"  # number of the training shape, or a code.npy that `complete` wrote
