@@ -212,7 +212,7 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
 
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
-    options = ("--points", 50, "--solver", "adam", "--iterations", 30, "--starts", 2, "--resolution", 16)
+    options = ("--points", 50, "--solver", "adam", "--iterations", 15, "--starts", 2, "--resolution", 16)
     run("complete", model, observation, "--reference", tmp_path / "true.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
     assert names(out) == COMPLETED
