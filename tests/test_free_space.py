@@ -8,11 +8,12 @@ import trimesh
 
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.solid import Solid
 from distrace.fields.base import SDF
 from distrace.fitting.free_space import LEFT_OUT, MARGIN, completed, consistent, free_space
 from distrace.mesh import MeshConfig
+from experiments.datasets.solids import observe
 
 BESIDE, BEFORE, BEHIND = (0.7, 0.0, 0.0), (0.0, 0.0, 0.7), (0.0, 0.0, -0.7)
 

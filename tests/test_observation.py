@@ -8,9 +8,10 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
-from distrace.data.observation import View, load_view, observe, save_view
+from distrace.data.observation import View, load_view, save_view
 from distrace.data.solid import Solid
 from distrace.rays import meet_sphere
+from experiments.datasets.solids import observe
 
 CAMERA = Camera.orbit(30, 20, 2.5, height=32, width=40, focal_px=40.0)
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from distrace.data.pictures import picture_size, read_mask, read_picture, save_mask, save_picture
+from distrace.data.pictures import picture_size, read_mask, read_picture
 
 LEVELS = np.random.default_rng(1).integers(0, 256, (5, 7, 4), np.uint8)
 
@@ -58,13 +58,13 @@ def test_a_palette_and_a_bitmap_are_read_as_colours(tmp_path: Path) -> None:
     assert torch.equal(read_mask(stored(tmp_path, LEVELS[..., 0] > 90)), torch.from_numpy(LEVELS[..., 0] > 90))
 
 
-def test_pictures_and_masks_are_read_as_they_were_saved(tmp_path: Path) -> None:
-    image, mask = torch.from_numpy(LEVELS[..., :3].astype(np.float32) / 255), torch.from_numpy(LEVELS[..., 3] > 60)
-    save_picture(tmp_path / "deeper" / "a.png", image)
-    save_mask(tmp_path / "m.png", mask)
-    assert torch.equal(read_picture(tmp_path / "deeper" / "a.png")[0], image)
-    assert torch.equal(read_mask(tmp_path / "m.png"), mask)
-    assert picture_size(tmp_path / "m.png") == (5, 7)
+def test_pictures_and_masks_have_the_levels_of_their_files(tmp_path: Path) -> None:
+    mask = LEVELS[..., 3] > 60
+    image = torch.from_numpy(LEVELS[..., :3].astype(np.float32) / 255)
+    assert torch.equal(read_picture(stored(tmp_path, LEVELS[..., :3]))[0], image)
+    grey = stored(tmp_path, mask.astype(np.uint8) * 255, "m.png")
+    assert torch.equal(read_mask(grey), torch.from_numpy(mask))
+    assert picture_size(grey) == (5, 7)
 
 
 def test_exif_leaves_the_image_as_it_is_stored(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import torch
 from distrace.benchmarks import agreement as views
 from distrace.benchmarks.agreement import ViewRow, badness, largest_part, measure_view, summaries
 from distrace.benchmarks.measuring import reference_depth, reference_distance
-from distrace.benchmarks.pages import described, pictures_of, views_page
+from distrace.benchmarks.pictures import pictures_of
 from distrace.benchmarks.random_views import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
@@ -187,26 +187,18 @@ def test_the_reference_does_not_look_before_the_ray_begins() -> None:
     torch.testing.assert_close(found, torch.tensor([0.005]), atol=2e-6, rtol=0)
 
 
-def test_the_page_shows_the_summary_first_and_then_the_worst_views() -> None:
+def test_pictures_are_cropped_to_the_object_and_a_view_with_more_wrong_pixels_is_worse() -> None:
     coarse = replace(CAUTIOUS, steps=3)
     bad = measure_view(View("ball", Mixture(1, 2, 0.25), sphere(0.5), SHOT), "coarse", coarse)
     good = measure_view(BALL, "coarse", CAUTIOUS)
     assert bad.row.fails
     assert badness(bad) > badness(good)
-    rows = [bad.row, good.row]
-    text = views_page("coarse", 7, summaries(rows), rows, [bad, good])
-    assert "1 of 2 random views pass" in text
-    assert text.index("fails: ") < text.index("<img")
-    assert text.count("<img") == 6
-    assert "0.75 · 1 + 0.25 · 2" in text
     reference, rendered, masks = pictures_of(bad)
     assert (reference != 255).any(-1).sum() == (masks != 255).any(-1).sum() > (rendered != 255).any(-1).sum()
     height, width, _ = reference.shape
     assert 128 < max(height, width) <= 256, "cropped, and enlarged"
     assert (masks != 255).any(-1).mean() > 0.4
     assert (masks == 255).all(-1)[:4].all(), "with a margin"
-    assert described(12) == "12"
-    assert described(None) == ""
 
 
 def test_a_bundled_model_is_measured_as_it_is() -> None:
@@ -226,19 +218,3 @@ def test_sizes_that_no_image_has_are_refused() -> None:
 def test_a_view_of_nothing_has_a_picture_too() -> None:
     nothing = measure_view(View("nothing", None, sphere(0.5, torch.tensor([0.0, 9, 0])), SHOT), "cautious", CAUTIOUS)
     assert all((picture == 255).all() and picture.shape == (256, 256, 3) for picture in pictures_of(nothing))
-
-
-def test_a_reference_is_kept_and_read_again(tmp_path) -> None:
-    first = measure_view(BALL, "cautious", CAUTIOUS, tmp_path)
-    (path,) = tmp_path.iterdir()
-    with np.load(path) as content:
-        assert content["depth"].shape == first.truth.shape
-    np.savez(path, depth=first.truth.numpy() + 1, seconds=np.float32(7))
-    again = measure_view(BALL, "cautious", CAUTIOUS, tmp_path)
-    assert again.row.reference_seconds == 7
-    torch.testing.assert_close(again.truth, first.truth + 1)
-    other = replace(BALL, sdf=sphere(0.4))
-    assert measure_view(other, "cautious", CAUTIOUS, tmp_path).row.pixels < first.row.pixels
-    path.write_bytes(b"no archive")
-    with pytest.raises(ValueError, match="holds no reference"):
-        measure_view(BALL, "cautious", CAUTIOUS, tmp_path)

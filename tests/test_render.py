@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from scipy.ndimage import binary_dilation, binary_erosion
 from torch import Tensor
 
 from distrace.camera import Camera
@@ -287,3 +289,14 @@ def test_values_are_equal_by_value_and_fit_on_a_line() -> None:
     assert repr(buffers) == f"Buffers(float64[24, 24], {hits} of 576 rays hit, radius=1)"
     assert repr(buffers.trace).startswith(f"Trace(float64[24, 24], {hits} hits, ")
     assert repr(buffers.rays) == "Rays(origins=float64[24, 24, 3], directions=float64[24, 24, 3])"
+
+
+def test_the_clearance_near_an_outline_is_that_of_all_rays_and_inf_elsewhere() -> None:
+    buffers = render(primitives.sphere(0.5), Camera.orbit(0, 0, 4, height=24, width=24))
+    near = buffers.clearance_near(2)
+    square = np.ones((5, 5), dtype=bool)
+    mask = buffers.mask.numpy()
+    expected = binary_dilation(mask, square) & ~binary_erosion(mask, square)
+    assert 0 < expected.sum() < expected.size
+    assert (near.isfinite().numpy() == expected).all()
+    torch.testing.assert_close(near[near.isfinite()], buffers.clearance[near.isfinite()])

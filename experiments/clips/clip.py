@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from PIL import Image
 
 from distrace.camera import Camera
-from distrace.data.pictures import save_mask
 from distrace.data.shapes import Shape
 from distrace.errors import explained
 from distrace.files import save_json, written
@@ -116,7 +116,8 @@ def save_frame(
     """Writes the image, and in `truth/` the mask (255 is the shape) and the depth z, `inf` on the background."""
     with written(folder / f"truth/depth/{frame:03d}.npy") as file:
         np.save(file, depth)
-    save_mask(folder / f"truth/masks/{frame:03d}.png", torch.from_numpy(mask))
+    with written(folder / f"truth/masks/{frame:03d}.png") as file:
+        Image.fromarray(mask.astype(np.uint8) * 255).save(file, "PNG")
     save_png(folder / image_name(frame), image)
 
 

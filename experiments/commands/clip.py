@@ -9,9 +9,9 @@ from typing import Annotated
 import tyro
 
 from distrace.cli.console import console, origin, progress, start
-from distrace.data.mesh_files import mesh_of
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
+from experiments.datasets.solids import mesh_of
 from experiments.datasets.splits import Meshes
 
 

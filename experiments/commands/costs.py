@@ -6,13 +6,12 @@ from pathlib import Path
 import torch
 import tyro
 
-from distrace.benchmarks.backward import timings
 from distrace.benchmarks.measuring import poster_view
 from distrace.cli.bench import finish, rows_of, show
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.files import save_json, save_text
-from experiments.costs import fields, gradients, growth, pages, solvers
+from experiments.costs import backward, fields, gradients, growth, pages, solvers
 from experiments.datasets.splits import on_side
 
 Name = tyro.conf.Positional[ModelName]
@@ -117,7 +116,7 @@ class Gradients:
                     ratios.append(ratio.numpy())
                     bar.advance(f"{row.field} by {row.parameter}, {row.method}")
         save_text(run.out / "index.html", pages.gradients_page(rows, ratios))
-        times = timings(model, self.code, poster_view().to(run.device), self.repeats)
+        times = backward.timings(model, self.code, poster_view().to(run.device), self.repeats)
         facts = rows_of(self.model, rows)
         timing = rows_of(self.model, times)
         show(facts)

@@ -1,12 +1,13 @@
 """Pages of the costs of tracing and fitting: tables and charts."""
 
 from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
 from distrace import shading
-from distrace.benchmarks.pages import rows_table
-from distrace.report.page import Html, error_ramp, figure, page, section, table
+from distrace.report.page import Html, error_ramp, figure, page, section, short, table
 from distrace.shading import Picture
 from experiments.charts import courses, growth
 from experiments.costs.fields import FieldRow
@@ -81,6 +82,13 @@ def ratio_map(ratio: np.ndarray) -> Picture:
     """Returns ratios as colours: grey is right, red too large, blue too small, white has none."""
     doublings = np.log2(np.where(ratio > 0, ratio, np.where(np.isnan(ratio), np.nan, 2**-DOUBLINGS)))
     return shading.error_picture(doublings, DOUBLINGS).repeat(ENLARGED, 0).repeat(ENLARGED, 1)
+
+
+def rows_table(rows: Sequence[Any]) -> Html:
+    """Returns a table of dataclasses, with short numbers; `share` is left out."""
+    lines = [asdict(line) for line in rows]
+    names = [name for name in lines[0] if name != "share"]
+    return table([name.replace("_", " ") for name in names], [[short(line[name]) for name in names] for line in lines])
 
 
 def _charts(rows: Sequence[GrowthRow]) -> list[Html]:

@@ -11,9 +11,8 @@ from torch import Tensor
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.shapes import Shape
-from distrace.data.solid import solid_of
 from distrace.fields.decoder import Decoder
 from distrace.fitting.fit import FitConfig, Step, fit_shape, view_terms
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
@@ -21,6 +20,7 @@ from distrace.fitting.ray_sampling import Pool
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.prior import Prior, prior_of
+from experiments.datasets.solids import observe, solid_of
 from experiments.tables.completion import OBSERVATION_SIZE
 
 ADAM = FitConfig(iterations=200, starts=1)

@@ -1,9 +1,9 @@
 """Pictures of meshes."""
 
 from distrace.camera import Camera
-from distrace.data.observation import observe
 from distrace.data.solid import Solid
 from distrace.shading import Picture
+from experiments.datasets.solids import observe
 
 
 def pictured(solid: Solid, camera: Camera) -> Picture:

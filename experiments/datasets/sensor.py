@@ -14,9 +14,10 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from distrace.camera import Camera
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.solid import Solid
 from distrace.pose import Similarity
+from experiments.datasets.solids import observe
 
 HEIGHT = 240
 WIDTH = 320

@@ -11,11 +11,11 @@ from torch import Tensor
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model
 from distrace.data.shapes import Shape
-from distrace.data.solid import solid_of
 from distrace.render import render
 from distrace.report.completion_page import View
 from distrace.shading import Picture, grid, side_by_side
 from experiments.datasets.pictured import pictured
+from experiments.datasets.solids import solid_of
 
 TILE = 128  # pixels
 ACROSS = 8  # pairs in a row

@@ -9,7 +9,7 @@ import trimesh
 
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs
 from distrace.data.solid import Solid
@@ -17,6 +17,7 @@ from distrace.files import save_text
 from distrace.report.page import figure, page, paragraph, ramp, row, section, short, table
 from distrace.report.scene import scene
 from distrace.shading import Picture, colour_picture, error_picture, grid, save_png
+from experiments.datasets.solids import observe
 from experiments.tables.multiview import ClipResult, ClipTrial, Surface, clip_done, described, surface_of
 from experiments.tables.sparse_depth import true_solid
 

@@ -11,10 +11,9 @@ import trimesh
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model
-from distrace.data.observation import observe
 from distrace.data.samples import sample
 from distrace.data.shapes import Shape
-from distrace.data.solid import Solid, solid_of
+from distrace.data.solid import Solid
 from distrace.fitting.fit_code import CodeFitConfig, fit_points
 from distrace.fitting.free_space import completed
 from distrace.mesh import MeshConfig, extract_mesh
@@ -22,6 +21,7 @@ from distrace.metrics import chamfer
 from distrace.prior import prior_of
 from distrace.shading import Picture, grid
 from experiments.datasets.pictured import pictured
+from experiments.datasets.solids import observe, solid_of
 from experiments.tables.methods import METHODS, completed_by, observation_of
 
 OBSERVATION_SIZE = 256

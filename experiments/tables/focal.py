@@ -6,9 +6,9 @@ from statistics import median
 
 import torch
 
-from distrace.data.observation import observe
 from distrace.metrics import depth_errors, iou
 from distrace.render import render
+from experiments.datasets.solids import observe
 from experiments.tables.sparse_depth import RATIOS, Trial, camera_of, done, true_solid
 from experiments.tables.trials import Place, grouped
 

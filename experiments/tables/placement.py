@@ -16,7 +16,7 @@ from scipy.spatial import KDTree
 from torch import Tensor
 
 from distrace.data.scan import scan_of_view
-from distrace.data.solid import Solid, normalised, normalised_frame, solid_of
+from distrace.data.solid import Solid, normalised, normalised_frame
 from distrace.data.up import Up
 from distrace.files import save_json
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
@@ -25,6 +25,7 @@ from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from experiments.datasets.sensor import Scene, sensed
+from experiments.datasets.solids import solid_of
 from experiments.datasets.splits import shape_of
 from experiments.procedural import procedural_mesh
 from experiments.tables.sparse_depth import held_out

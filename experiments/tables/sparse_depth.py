@@ -16,14 +16,15 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.shapes import Shape
-from distrace.data.solid import Solid, solid_of
+from distrace.data.solid import Solid
 from distrace.files import save_json
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.free_space import completed
 from distrace.metrics import chamfer
 from experiments.datasets.noise import NOISES, noisy
+from experiments.datasets.solids import observe, solid_of
 from experiments.datasets.splits import on_side, shape_of
 from experiments.tables.methods import completed_by, observation_of, settings_of
 from experiments.tables.trials import Place, fingerprint, hash_of, read_json

@@ -9,10 +9,11 @@ import trimesh
 from jaxtyping import Float
 from scipy.spatial import KDTree
 
-from distrace.data.mesh_files import load_soup, mesh_of
+from distrace.data.mesh_files import load_soup
 from distrace.data.shapes import Shape
 from distrace.data.solid import normalised
 from distrace.metrics import surface_points
+from experiments.datasets.solids import mesh_of
 
 POINTS = 4000  # of each shape
 

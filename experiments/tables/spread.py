@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from scipy.stats import rankdata
 
-from distrace.data.observation import observe
 from distrace.data.shapes import Shape
 from distrace.fitting.completing import complete_shape, plausible, spread
 from distrace.fitting.fit_code import CodeFitConfig
@@ -18,6 +17,7 @@ from distrace.fitting.free_space import completed
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
 from distrace.processes import each_done
+from experiments.datasets.solids import observe
 from experiments.tables.sparse_depth import camera_of, true_solid
 from experiments.tables.trials import hash_of, opened_once
 

@@ -17,7 +17,7 @@ from distrace.tracing.tracer import TracerConfig
 
 Pictures = UInt8[np.ndarray, "frames height width 3"]
 
-FRAME = Fraction(8, 100)  # seconds, by default; a GIF counts in hundredths
+FRAME = Fraction(8, 100)  # seconds of each picture; a GIF counts in hundredths
 BT709 = 1  # H.264's number for the colours, the curve and the matrix of HD television
 
 
@@ -45,8 +45,8 @@ def filmed(
         yield buffers
 
 
-def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
-    """Writes [frames, height, width, 3] as H.264 that browsers play, each picture for `frame` seconds.
+def save_mp4(path: str | Path, pictures: Pictures) -> None:
+    """Writes [frames, height, width, 3] as H.264 that browsers play.
 
     Its sides are even: odd ones get a white row below, a white column on the right. Raises `ValueError` for no picture.
     """
@@ -58,7 +58,7 @@ def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
     even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
     with written(path) as file:  # by its name: to bring the index to the front, the file is read again
         with av.open(file.name, "w", format="mp4", options={"movflags": "faststart"}) as movie:
-            stream = movie.add_stream("libx264", rate=1 / frame, options={"crf": "18"})
+            stream = movie.add_stream("libx264", rate=1 / FRAME, options={"crf": "18"})
             stream.height, stream.width = even.shape[1:3]
             stream.pix_fmt = "yuv420p"
             stream.color_range = ColorRange.MPEG
@@ -72,7 +72,7 @@ def save_mp4(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
             movie.mux(stream.encode())
 
 
-def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> None:
+def save_gif(path: str | Path, pictures: Pictures) -> None:
     """Writes [frames, height, width, 3] in 256 colours chosen for all of them together; plays for ever.
 
     Pictures that equal the one before become one with it, shown for longer. Raises `ValueError` for no picture.
@@ -84,7 +84,7 @@ def save_gif(path: str | Path, pictures: Pictures, frame: Fraction = FRAME) -> N
     images = [Image.fromarray(picture) for picture in pictures]
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
     with written(path) as file:
-        first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 * frame), loop=0)
+        first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 * FRAME), loop=0)
 
 
 def _not_empty(pictures: Pictures) -> Pictures:

@@ -16,13 +16,13 @@ from trimesh.visual.material import SimpleMaterial
 
 from distrace.camera import Camera
 from distrace.data.mesh_files import load_soup
-from distrace.data.observation import observe
 from distrace.data.solid import Solid, load_solid, turned
 from experiments.__main__ import main
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.clutter import NEAREST, boxes, sky
 from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
 from experiments.clips.solid_texture import mottled, value_noise
+from experiments.datasets.solids import observe
 
 RED, GREEN, BLUE, WHITE = (220, 30, 30), (30, 200, 30), (30, 30, 220), (230, 230, 230)
 TURN = 40.0

@@ -6,9 +6,10 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
-from distrace.data.observation import View, observe
+from distrace.data.observation import View
 from distrace.data.solid import Solid
 from experiments.datasets.noise import NOISES, SIZE, STEP, noisy
+from experiments.datasets.solids import observe
 
 CAMERA = Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=96, width=96)
 

@@ -1,6 +1,6 @@
 """Cases of `bench trace`: DIST's strategies, its original code, and the default tracer (`fast`)."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
@@ -11,7 +11,7 @@ from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.fields.base import SDF, chunked
 from distrace.rays import Bounds, meet_sphere
-from distrace.render import STRATEGIES, Buffers, Config, render
+from distrace.render import STRATEGIES, Buffers, render
 from distrace.tracing.sphere_tracing import COARSE_TO_FINE, PARALLEL, Trace, sphere_trace
 
 NAIVE_RAYS = 100  # the sample that the row `naive` is extrapolated from
@@ -20,14 +20,12 @@ COUNT = 8  # of rows
 TURN = 10.0  # degrees to the next view
 
 
-def of_field(
-    sdf: SDF, camera: Camera, strategies: Mapping[str, Config] = STRATEGIES, radius: float = 1.0
-) -> Iterator[Case]:
+def of_field(sdf: SDF, camera: Camera) -> Iterator[Case]:
     """Yields `naive` (a sample of rays, one after another) and the strategies, on one view of any field."""
-    truth = reference_depth(sdf, camera, radius)
-    yield _naive(sdf, camera, truth, radius)
-    for name, config in strategies.items():
-        yield Case(name, lambda config=config: render(sdf, camera, radius=radius, config=config), truth)
+    truth = reference_depth(sdf, camera)
+    yield _naive(sdf, camera, truth)
+    for name, config in STRATEGIES.items():
+        yield Case(name, lambda config=config: render(sdf, camera, config=config), truth)
 
 
 def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
@@ -42,10 +40,10 @@ def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
     yield Case("fast_next", lambda: render(sdf, turned, occupancy=first.occupancy), reference_depth(sdf, turned))
 
 
-def _naive(sdf: SDF, camera: Camera, truth: Tensor, radius: float) -> Case:
+def _naive(sdf: SDF, camera: Camera, truth: Tensor) -> Case:
     """Returns the case of one ray after another, each for all of its steps."""
     rays = camera.rays().flat()
-    bounds = meet_sphere(rays, radius)
+    bounds = meet_sphere(rays)
     entering = bounds.meets.nonzero()[:, 0]
     sample = entering[torch.randperm(len(entering), generator=torch.Generator().manual_seed(0))[:NAIVE_RAYS]]
     cosines = camera.cosines().reshape(-1)[sample]
@@ -60,7 +58,7 @@ def _naive(sdf: SDF, camera: Camera, truth: Tensor, radius: float) -> Case:
     def render_each() -> Buffers:
         traces = [trace_one(k) for k in sample]
         images = {name: torch.cat([trace.images()[name] for trace in traces]) for name in traces[0].images()}
-        return Buffers(sdf, rays[sample], cosines, replace(traces[0], **images), radius)
+        return Buffers(sdf, rays[sample], cosines, replace(traces[0], **images), 1.0)
 
     return Case("naive", render_each, truth.reshape(-1)[sample], len(sample) / len(entering))
 

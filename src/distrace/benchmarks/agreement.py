@@ -5,10 +5,8 @@ if all of its views pass and the median view is nearly perfect.
 """
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from hashlib import sha256
-from pathlib import Path
 from statistics import median
 from typing import Any
 
@@ -19,11 +17,12 @@ from torch import Tensor
 
 from distrace.benchmarks.measuring import OUTLIER, reference_depth, timed
 from distrace.benchmarks.random_views import Mixture, Shot, View
-from distrace.errors import explained
-from distrace.files import save_arrays
 from distrace.metrics import depth_errors, iou
 from distrace.render import Buffers, Config, render
 from distrace.tracing.sphere_tracing import Outcome
+
+Reference = tuple[Float[Tensor, "size size"], float]
+"""The depth by the reference, and its seconds."""
 
 LEAST_IOU = 0.995  # of a view
 SMALL = 1600  # pixels: a smaller object is judged by WRONG instead of by IoU
@@ -82,48 +81,32 @@ class Summary:
     bar: str  # "met", or the bars that fail
 
 
-def measure_view(
-    view: View, strategy: str = "default", config: Config | None = None, references: Path | None = None
-) -> Measured:
-    """Renders a view by a configuration, or by the default of `render`, and compares it with the reference.
-
-    The folder `references` keeps reference depths between runs. Raises `ValueError` for a file there that is none.
-    """
-    options: dict[str, Any] = {} if config is None else {"config": config}
-    buffers, seconds = timed(lambda: render(view.sdf, view.camera(), **options))
-    truth, reference_seconds = _reference(view, references)
-    return Measured(_row(view, strategy, buffers, truth, seconds, reference_seconds), view, buffers, truth)
-
-
-def _reference(view: View, references: Path | None) -> tuple[Float[Tensor, "size size"], float]:
-    """Returns the depth by the reference, and its seconds."""
-    path = references and references / f"{_digest(view)}.npz"
-    if path and path.exists():
-        with explained(f"{path} holds no reference; delete it to compute it again"), np.load(path) as content:
-            return torch.from_numpy(content["depth"]).to(view.device), float(content["seconds"])
+def reference_of(view: View) -> Reference:
+    """Computes the reference of a view."""
     start = time.perf_counter()
     depth = reference_depth(lambda points: view.sdf(points) / view.lipschitz, view.camera())
-    seconds = time.perf_counter() - start
-    if path:
-        save_arrays(path, {"depth": depth, "seconds": torch.tensor(seconds)})
-    return depth, seconds
+    return depth, time.perf_counter() - start
 
 
-def _digest(view: View) -> str:
-    """Returns a hash of the camera, and of the field's values at 64 points."""
-    points = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (64, 3))).float().to(view.device)
-    with torch.no_grad():
-        values = view.sdf(points).cpu().numpy().round(5)
-    return sha256(f"{view.shot} {view.lipschitz} {values.tolist()}".encode()).hexdigest()[:24]
+def measure_view(
+    view: View,
+    strategy: str = "default",
+    config: Config | None = None,
+    reference: Callable[[View], Reference] = reference_of,
+) -> Measured:
+    """Renders a view by a configuration, or by the default of `render`, and compares it with the reference."""
+    options: dict[str, Any] = {} if config is None else {"config": config}
+    buffers, seconds = timed(lambda: render(view.sdf, view.camera(), **options))
+    truth, reference_seconds = reference(view)
+    return Measured(_row(view, strategy, buffers, truth, seconds, reference_seconds), view, buffers, truth)
 
 
 def largest_part(mask: Bool[np.ndarray, "height width"]) -> int:
     """Returns the pixels of the largest part connected by edges or corners; 0 for an empty mask."""
-    from scipy import ndimage
+    from skimage.measure import label
 
-    labels = np.zeros(mask.shape, dtype=np.int32)
-    ndimage.label(mask, structure=np.ones((3, 3)), output=labels)
-    return int(np.bincount(labels.ravel())[1:].max(initial=0))
+    parts = np.asarray(label(mask, connectivity=2))
+    return int(np.bincount(parts.ravel())[1:].max(initial=0))
 
 
 def summaries(rows: Sequence[ViewRow]) -> list[Summary]:

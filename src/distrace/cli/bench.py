@@ -1,4 +1,4 @@
-"""`bench`: the tracer's cost and error, as JSON, as a page and in the terminal."""
+"""`bench`: the tracer's cost and error, as JSON and in the terminal."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -7,15 +7,14 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from distrace.benchmarks import ablation, pages
-from distrace.benchmarks.backward import timings
+from distrace.benchmarks import ablation
 from distrace.benchmarks.measuring import measure, poster_view
+from distrace.benchmarks.pictures import MAPPED, query_map
 from distrace.checking.gradcheck import check_gradients
 from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.common import default, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
-from distrace.files import save_text
 from distrace.shading import save_png, side_by_side
 
 HIDDEN = ("model", "share", "runs")  # columns that the terminal does not show
@@ -35,7 +34,7 @@ class Bench:
 
     what: tyro.conf.Positional[Literal["trace", "views", "gradients"]]
     """trace: every strategy on one view; views: the default tracer on random views; gradients: derivatives against
-    finite differences, and the time of a backward pass"""
+    finite differences"""
     models: tyro.conf.Positional[
         Annotated[
             tuple[str, ...], tyro.conf.arg(metavar="[MODEL …]", help_behavior_hint="(default of `views`: all bundled)")
@@ -44,21 +43,19 @@ class Bench:
     """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, the others one"""
     out: Path = Path("out/bench")
     code: int = 0  # number of the training shape
-    size: int = 512  # pixels along each side, for `trace` and the times of `gradients`
+    size: int = 512  # pixels along each side, for `trace`; for `gradients` at most 48
     repeats: int = 5  # timed runs of each row, after a warm-up; a row that takes over a minute runs once
     views: int = 60  # for `views`: random views of each model
     sizes: tuple[int, int] = (128, 512)  # for `views`: the smallest and the largest image, in pixels along each side
     strategy: Annotated[str | None, default("fast", "STR")] = None  # for `views`: as in `distrace render`
     seed: int = 0  # for `views`
-    references: Annotated[Path | None, default("none", "PATH")] = None
-    """for `views`: a folder that caches references, which take most of the time"""
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         if self.what == "views":
             names = self.models or bundled_models()
-            bench_views(run, Plan(names, self.views, self.sizes, self.seed, self.strategy, self.references))
+            bench_views(run, Plan(names, self.views, self.sizes, self.seed, self.strategy))
         else:
             getattr(self, f"_{self.what}")(run, opened(self.model, run.device))
 
@@ -79,11 +76,8 @@ class Bench:
                 bar.advance(case.strategy)
         with progress("runs", len(cases) * (self.repeats + 1 if self.repeats > 1 else 1)) as bar:
             measured = measure(cases, self.repeats, bar.advance)
-        truths = [case.truth.cpu().numpy() for case in cases]
-        maps = {row.strategy: pages.query_map(buffers) for row, buffers in measured if row.strategy in pages.MAPPED}
-        save_png(run.out / "evaluations.png", side_by_side(list(maps.values())))
-        with run.optional("index.html"):
-            save_text(run.out / "index.html", pages.trace_page(self.model, measured, truths))
+        maps = [query_map(buffers) for row, buffers in measured if row.strategy in MAPPED]
+        save_png(run.out / "evaluations.png", side_by_side(maps))
         finish(run, rows_of(self.model, [row for row, _ in measured]))
 
     def _gradients(self, run: Run, model: Model) -> None:
@@ -103,13 +97,8 @@ class Bench:
             }
             for row in found.rows
         ]
-        times = timings(model, self.code, poster_view(self.size).to(run.device), self.repeats)
-        with run.optional("index.html"):
-            save_text(run.out / "index.html", pages.gradients_page(rows, times))
-        timing = rows_of(self.model, times)
         show(rows)
-        show(timing)
-        run.finish({"rows": rows, "timing": timing, **origin(), "evaluations": found.evaluations})
+        run.finish({"rows": rows, **origin(), "evaluations": found.evaluations})
 
 
 def rows_of(model: str, measured: Iterable[Any]) -> list[dict[str, Any]]:

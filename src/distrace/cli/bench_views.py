@@ -2,19 +2,17 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
-from distrace.benchmarks.agreement import Measured, badness, measure_view, summaries
-from distrace.benchmarks.pages import pictures_of, views_page
+from distrace.benchmarks.agreement import Measured, Reference, badness, measure_view, reference_of, summaries
+from distrace.benchmarks.pictures import pictures_of
 from distrace.benchmarks.random_views import View, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, origin, progress
-from distrace.files import save_text
 from distrace.render import STRATEGIES
 from distrace.shading import grid, save_png
 
-SHOWN = 10  # the worst views on the page
+SHOWN = 10  # of the worst views
 
 
 @dataclass(frozen=True)
@@ -26,7 +24,6 @@ class Plan:
     sizes: tuple[int, int]
     seed: int
     strategy: str | None  # None: the default of `render`
-    references: Path | None = None  # a folder that keeps references
 
     def __post_init__(self) -> None:
         if self.views < 1:
@@ -42,13 +39,17 @@ class Plan:
         for model in models:
             yield from model_views(model, self.views, self.sizes, self.seed)
 
+    def reference(self, view: View) -> Reference:
+        """Computes the reference of a view."""
+        return reference_of(view)
+
     def count(self) -> int:
         """Returns the number of all views."""
         return len(self.models) * self.views
 
 
 def bench_views(run: Run, plan: Plan) -> None:
-    """Measures all views; writes `result.json`, `index.html` and `worst.png`."""
+    """Measures all views; writes `result.json` and `worst.png`."""
     strategy = plan.strategy or "default"
     config = STRATEGIES[plan.strategy] if plan.strategy else None
     models = [opened(name, run.device) for name in plan.models]  # before any view: a wrong name must fail at once
@@ -56,15 +57,13 @@ def bench_views(run: Run, plan: Plan) -> None:
     worst: list[Measured] = []
     with progress("views", plan.count()) as bar:
         for view in plan.draw(models):
-            measured = measure_view(view, strategy, config, plan.references)
+            measured = measure_view(view, strategy, config, plan.reference)
             rows.append(measured.row)
             worst = sorted([*worst, measured], key=badness, reverse=True)[:SHOWN]  # frees the other images
             seconds = measured.row.seconds + measured.row.reference_seconds
             bar.advance(f"{view.model}: IoU {measured.row.iou:.4f}, {seconds:.1f} s")
     lines = summaries(rows)
     save_png(run.out / "worst.png", grid([pictures_of(measured) for measured in worst]))
-    with run.optional("index.html"):
-        save_text(run.out / "index.html", views_page(strategy, plan.seed, lines, rows, worst))
     show_table([asdict(line) for line in lines])
     evaluations = {name: sum(getattr(row, name) for row in rows) for name in ("evaluations", "setup_evaluations")}
     facts = {"strategy": strategy, "seed": plan.seed, "views": plan.views, "sizes": list(plan.sizes)}

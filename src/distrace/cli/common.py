@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -24,7 +25,10 @@ from distrace.report.page import short
 if TYPE_CHECKING:
     import trimesh
 
-ModelName = Annotated[str, tyro.conf.arg(metavar="MODEL")]
+ModelName = Annotated[
+    str,
+    tyro.conf.arg(metavar="MODEL", help="a bundled model, a DeepSDF experiment folder, or a run of `train`"),
+]
 Views = Annotated[
     Path,
     tyro.conf.arg(
@@ -71,18 +75,29 @@ def check_distance(distance: float | None) -> None:
         raise ValueError(f"--distance {distance} was given; it cannot be negative")
 
 
-def orbiting(view: Any) -> Camera:
-    """Returns the camera of a command's options. Raises `ValueError` where one is out of range."""
-    check_distance(view.distance)
-    return Camera.orbit(
-        view.azimuth,
-        view.elevation,
-        view.distance,
-        focal_mm=view.focal_mm,
-        sensor_mm=view.sensor_mm,
-        height=view.size,
-        width=view.size,
-    )
+@dataclass(frozen=True, kw_only=True)
+class Orbit:
+    """The options of a camera that looks at the origin."""
+
+    azimuth: float = 30.0  # degrees
+    elevation: float = 20.0  # degrees
+    distance: float = 4.97  # from the camera to the origin, in radii of the unit sphere
+    focal_mm: float = 60.0
+    sensor_mm: float = 32.0
+    size: int = 512  # pixels along each side
+
+    def camera(self) -> Camera:
+        """Returns the camera of the options. Raises `ValueError` where one is out of range."""
+        check_distance(self.distance)
+        return Camera.orbit(
+            self.azimuth,
+            self.elevation,
+            self.distance,
+            height=self.size,
+            width=self.size,
+            focal_mm=self.focal_mm,
+            sensor_mm=self.sensor_mm,
+        )
 
 
 def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:

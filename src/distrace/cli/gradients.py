@@ -1,38 +1,33 @@
 """`check-gradients`: every derivative of an image of a model against finite differences."""
 
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import tyro
 
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, GradientRow, check_gradients
-from distrace.cli.common import ModelName, opened, orbiting, show_table
+from distrace.cli.common import ModelName, Orbit, opened, show_table
 from distrace.cli.console import origin, start
 
 
 @dataclass(frozen=True)
-class CheckGradients:
+class CheckGradients(Orbit):
     """Compare every derivative of an image with finite differences.
 
     The exit status is 1 where one disagrees.
     """
 
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/check-gradients")
     code: int = 0  # number of the training shape
-    azimuth: float = 30.0  # degrees
-    elevation: float = 20.0  # degrees
-    distance: float = 4.97  # from the camera to the origin
-    focal_mm: float = 60.0
-    sensor_mm: float = 32.0
-    size: int = 48  # pixels along each side
+    size: int = field(default=48, kw_only=True)  # pixels along each side
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
-        camera = orbiting(self).to(run.device)
+        camera = self.camera().to(run.device)
         found = check_gradients(model.field(self.code), camera, size=self.size)
         show_table([_line(row) for row in found.rows])
         tolerances = {"tolerance": found.precision.tolerance, "stray": STRAY, "footprint_tolerance": ROUGHLY}

@@ -17,7 +17,7 @@ from distrace.data.observation import View, read_view, save_view
 from distrace.errors import explained
 from distrace.fields.base import SDF
 from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
-from distrace.pose import pose_error, turned_object, zoomed
+from distrace.pose import pose_error
 from distrace.render import render
 
 FRAMES = 8  # of the film strip
@@ -32,7 +32,7 @@ class Pose:
     --elevation and --distance.
     """
 
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    model: tyro.conf.Positional[ModelName]
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
     out: Path = Path("out/pose")
     code: str = "0"  # number of the training shape, or a code.npy that `complete` wrote
@@ -42,9 +42,6 @@ class Pose:
     """degrees, of the initial camera"""
     elevation: Annotated[float | None, default("20, with --azimuth", "FLOAT")] = None  # degrees
     distance: Annotated[float | None, default("4.97, with --azimuth", "FLOAT")] = None  # to the origin
-    disturb: Annotated[float | None, default(0.0)] = None
-    """degrees by which the initial camera is rotated, to test convergence"""
-    disturb_focal: float = 1.0  # factor on the initial focal length, to test --focal
     starts: int = CameraConfig.starts  # of the multi-start fit
     seed: int = 0
     device: str = "cpu"
@@ -54,7 +51,7 @@ class Pose:
         model = opened(self.model, run.device)
         observed = read_view(self.observation, self.ignore).to(run.device)
         field = model.field(_code(model, self.code))
-        first = self._start(observed.camera)
+        first = replace(observed.camera, T_world_camera=self._initial_pose(observed.camera))
         steps = []
         with progress("fitting", STEPS) as bar:
             config = CameraConfig(starts=self.starts, focal=self.focal, seed=self.seed)
@@ -71,19 +68,8 @@ class Pose:
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
         self._finish(run, observed, steps)
 
-    def _start(self, camera: Camera) -> Camera:
-        if not 0 < self.disturb_focal < np.inf or not np.isfinite(self.disturb or 0.0):
-            given = f"--disturb {self.disturb} --disturb-focal {self.disturb_focal}"
-            raise ValueError(f"{given} were given; degrees and a positive factor are needed, both finite")
-        camera = replace(camera, T_world_camera=self._placed(camera))
-        camera = zoomed(camera, torch.tensor(self.disturb_focal).log())
-        if self.disturb is None:
-            return camera
-        axis = torch.randn(3, generator=torch.Generator().manual_seed(self.seed)).to(camera.intrinsics)
-        return turned_object(camera, axis / axis.norm() * np.deg2rad(self.disturb), torch.zeros_like(axis))
-
-    def _placed(self, camera: Camera) -> torch.Tensor:
-        """Returns the initial pose: the observation's, or that of the options."""
+    def _initial_pose(self, camera: Camera) -> torch.Tensor:
+        """Returns the observation's pose, or that of the options."""
         check_distance(self.distance)
         if self.azimuth is not None:
             elevation = 20.0 if self.elevation is None else self.elevation

@@ -10,7 +10,7 @@ import torch
 import tyro
 
 from distrace.camera import Camera
-from distrace.cli.common import Flag, ModelName, default, opened, orbiting, save_buffers, save_mesh, save_pictures
+from distrace.cli.common import Flag, ModelName, Orbit, default, opened, save_buffers, save_mesh, save_pictures
 from distrace.cli.console import progress, start
 from distrace.data.observation import View as Observation
 from distrace.data.observation import save_view
@@ -45,23 +45,17 @@ class Tally:
 
 
 @dataclass(frozen=True)
-class Render:
+class Render(Orbit):
     """Render one view: depth, normals, mask and a shaded picture.
 
     They are written as PNGs and as arrays; with --orbit also a movie.
     """
 
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/render")
     code: int = 0  # which training shape
     orbit: Annotated[int | None, default("no movie", "INT")] = None
     """frames of a movie (MP4 and GIF) that turns once around the vertical axis"""
-    azimuth: float = 30.0  # degrees
-    elevation: float = 20.0  # degrees
-    distance: float = 4.97  # from the camera to the origin, in radii of the unit sphere
-    focal_mm: float = 60.0
-    sensor_mm: float = 32.0
-    size: int = 512  # pixels along each side
     strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine", "fast"] = "fast"
     """fast is distrace's tracer; the others are DIST's strategies"""
     steps: Annotated[int | None, default("the strategy's", "INT")] = None  # maximum for a ray; not for fast
@@ -72,7 +66,7 @@ class Render:
         if self.orbit is not None:
             require("--orbit", "av")
         run = start(self.out, self.device)
-        camera = orbiting(self).to(run.device)
+        camera = self.camera().to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
         counted = Counted(opened(self.model, run.device).field(self.code))
         with torch.no_grad(), run.noticing():
@@ -142,7 +136,7 @@ def _each(tallies: list[Tally]) -> dict[str, Any]:
 class Mesh:
     """Extract a mesh by marching cubes."""
 
-    model: tyro.conf.Positional[ModelName]  # a bundled model, a DeepSDF experiment folder, or a run of `train`
+    model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/mesh")
     code: int = 0  # which training shape
     resolution: int = 256  # cells along each side of the cube around the unit sphere

@@ -47,12 +47,13 @@ def warped(solid: Solid, random: np.random.Generator) -> Solid:
 
 def _axis_map(random: np.random.Generator, even: bool) -> Float[np.ndarray, "knots"]:
     """The new coordinates of an axis's knots: the integral of a positive random density."""
+    from scipy.integrate import cumulative_trapezoid
+
     waves = np.arange(1, WAVES + 1)
     phases = np.pi * waves * (KNOTS[:, None] + 1) / 2 + random.uniform(0, 2 * np.pi, WAVES)
     logarithm = np.cos(phases) @ (random.normal(size=WAVES) * LOCAL_STRETCH / np.sqrt(waves))
     if even:
         logarithm = (logarithm + logarithm[::-1]) / 2
     density = np.exp(logarithm + random.uniform(-MAX_STRETCH, MAX_STRETCH))
-    steps = (density[1:] + density[:-1]) / 2 * np.diff(KNOTS)
-    moved = np.concatenate([[0.0], np.cumsum(steps)])
+    moved = cumulative_trapezoid(density, KNOTS, initial=0)
     return moved - moved[len(KNOTS) // 2]

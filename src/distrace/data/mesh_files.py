@@ -7,20 +7,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from distrace.data.ac3d import load_ac3d
-from distrace.data.shapes import Shape
 
 if TYPE_CHECKING:
     import trimesh
 
 ASCII = bytes(range(128)) + b"?" * 128  # what each byte becomes
-
-
-def mesh_of(shape: Shape, meshes: Path) -> Path:
-    """Returns a shape's file, in `meshes` or a folder in it. Raises `ValueError` where it is missing."""
-    for path in (meshes / shape.path, *sorted(meshes.glob(f"*/{shape.path}"))):
-        if path.is_file():
-            return path
-    raise ValueError(f"{meshes / shape.path} is missing; `distrace data furniture` and `… planes` fetch the meshes")
 
 
 def load_soup(path: Path) -> "trimesh.Trimesh":

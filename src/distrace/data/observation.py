@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 from zipfile import BadZipFile, is_zipfile
 
 import numpy as np
@@ -14,7 +13,6 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.arrays import camera_of, depth_image, mask_image, normal_image, read_arrays
 from distrace.data.checks import check_mask, check_normals, check_place
-from distrace.data.solid import Solid
 from distrace.errors import about
 from distrace.files import save_arrays
 from distrace.shading import Picture, shaded_picture
@@ -141,18 +139,3 @@ def save_view(path: Path, view: View) -> None:
     arrays = {"depth": view.depth, "intrinsics": view.camera.intrinsics, "T_world_camera": view.camera.T_world_camera}
     arrays |= {name: image for name, image in (("mask", view.mask), ("normal", view.normal)) if image is not None}
     save_arrays(path, arrays, {"frame": CANONICAL})
-
-
-def observe(solid: Solid, camera: Camera) -> View:
-    """Returns what the camera sees of a mesh's outer surface, by Embree's ray casting."""
-    rays = camera.rays()
-    origins = rays.origins.reshape(-1, 3).numpy()
-    directions = rays.directions.reshape(-1, 3).numpy()
-    cast: Any = solid.surface.ray.intersects_id
-    faces, pixels, points = cast(origins, directions, multiple_hits=False, return_locations=True)
-    depth = torch.full((len(origins),), torch.inf)
-    depth[pixels] = camera.project(torch.from_numpy(points).float())[1]
-    normal = torch.zeros(len(origins), 3)
-    normal[pixels] = torch.from_numpy(solid.surface.face_normals[faces]).float()
-    depth = depth.reshape(camera.height, camera.width)
-    return View(camera, depth, torch.isfinite(depth), normal.reshape(*depth.shape, 3))

@@ -13,7 +13,7 @@ from distrace.data.checks import check_intrinsics
 from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
 from distrace.data.photo_readers.frames import Shot, inside
 from distrace.data.photograph import Photograph as Photograph
-from distrace.data.pictures import read_mask, read_picture, save_mask, save_picture
+from distrace.data.pictures import read_mask, read_picture
 from distrace.data.placement import Placement as Placement
 from distrace.data.placement import among_points, between_axes
 from distrace.data.space_carving import within_masks
@@ -21,6 +21,7 @@ from distrace.errors import about
 from distrace.files import save_json
 from distrace.pixels import thinned
 from distrace.rays import meet_sphere
+from distrace.shading import colour_picture, save_png
 
 LAYOUTS = (own, transforms, idr, middlebury, colmap)
 LOOKED_FOR = (
@@ -75,10 +76,11 @@ def save_photographs(folder: Path, photographs: Photographs) -> None:
     names = _distinct([view.name for view in photographs.views])
     for name, view in zip(names, photographs.views):
         entry: dict[str, object] = {"image": f"images/{name}.png"}
-        save_picture(inside(folder, f"images/{name}.png", "the view"), view.image)
+        save_png(inside(folder, f"images/{name}.png", "the view"), colour_picture(view.image))
         if view.mask is not None:
             entry["mask"] = f"masks/{name}.png"
-            save_mask(folder / "masks" / f"{name}.png", view.mask)
+            white = view.mask[..., None].expand(-1, -1, 3).float()
+            save_png(folder / "masks" / f"{name}.png", colour_picture(white))
         double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
         entry["intrinsics"] = view.camera.intrinsics.tolist()
         entry["T_world_camera"] = photographs.placement.camera_to_world(double).T_world_camera.tolist()

@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.errors import explained
-from distrace.files import written
 
 FORMATS = ("PNG", "JPEG")
 EIGHT_BIT = ("L", "LA", "RGB", "RGBA")
@@ -61,16 +60,6 @@ def picture_size(path: Path) -> tuple[int, int]:
             return file.height, file.width
 
 
-def save_picture(path: Path, image: Float[Tensor, "height width 3"]) -> None:
-    """As a PNG of eight bits."""
-    _save(path, (image.detach().cpu() * 255).round().clamp(0, 255).to(torch.uint8).numpy())
-
-
-def save_mask(path: Path, mask: Bool[Tensor, "height width"]) -> None:
-    """As a grey PNG, white where the object is."""
-    _save(path, mask.cpu().numpy().astype(np.uint8) * 255)
-
-
 def _levels(path: Path) -> Float[Tensor, "height width channels"]:
     from PIL import Image
 
@@ -82,10 +71,3 @@ def _levels(path: Path) -> Float[Tensor, "height width channels"]:
             else:
                 levels = np.array(file.convert("RGBA" if file.has_transparency_data else "RGB"))
     return torch.from_numpy(levels.astype(np.float32) / full).reshape(*levels.shape[:2], -1)
-
-
-def _save(path: Path, levels: np.ndarray) -> None:
-    from PIL import Image
-
-    with written(path) as file:
-        Image.fromarray(levels).save(file, "PNG")

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from distrace.data.mesh_files import load_soup, mesh_of
-from distrace.data.shapes import Shape
+from distrace.data.mesh_files import load_soup
 from distrace.errors import explained
 from distrace.optional import require
 
@@ -67,11 +66,6 @@ def load_solid(path: Path) -> Solid:
     if surface.area < 0.05 * soup.area:
         raise ValueError(f"{path} bounds no solid: only {surface.area / soup.area:.0%} of its faces have an inside")
     return Solid(soup, surface)
-
-
-def solid_of(shape: Shape, meshes: Path) -> Solid:
-    """A shape of a split as it is learnt. Raises `ValueError` where its mesh is missing, or as `load_solid` does."""
-    return turned(load_solid(mesh_of(shape, meshes)), shape.turn)
 
 
 def turned(solid: Solid, degrees: float) -> Solid:
@@ -214,14 +208,11 @@ def _spread(tests: np.ndarray) -> Float[np.ndarray, "n 3"]:
 
 
 def _quartered(triangles: np.ndarray) -> np.ndarray:
-    a = triangles[:, 0]
-    b = triangles[:, 1]
-    c = triangles[:, 2]
-    ab = (a + b) / 2
-    bc = (b + c) / 2
-    ca = (c + a) / 2
-    parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
-    return np.concatenate([np.stack(part, axis=1) for part in parts])
+    from trimesh.remesh import subdivide
+
+    corners = triangles.reshape(-1, 3)
+    vertices, faces, *_ = subdivide(corners, np.arange(len(corners)).reshape(-1, 3))
+    return vertices[faces]
 
 
 def _winding(soup: "trimesh.Trimesh", points: np.ndarray) -> np.ndarray:
