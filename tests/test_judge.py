@@ -73,9 +73,11 @@ def test_another_fit_elsewhere_makes_it_doubtful() -> None:
     assert len(surface) > 250
     assert disagreement_of(surface, PLACE, []) == 0
     assert disagreement_of(surface, PLACE, [(SPHERE, PLACE)]) < 1e-2
-    apart = disagreement_of(surface, PLACE, [(primitives.sphere(0.8), PLACE)])
-    assert apart == pytest.approx(0.2, abs=0.02)
-    assert judged(scan(), SPHERE, PLACE, apart).name == "doubtful"
+    larger = [(primitives.sphere(0.8), PLACE)]
+    assert disagreement_of(surface, PLACE, larger) == pytest.approx(0.2, abs=0.02)
+    verdict = judged(scan(), SPHERE, PLACE, larger)
+    assert verdict.disagreement == pytest.approx(0.2, abs=0.02)
+    assert verdict.name == "doubtful"
 
 
 def test_a_wrong_silhouette_tells() -> None:

@@ -12,7 +12,7 @@ from torch import Tensor
 from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
-from distrace.fitting.judge import Verdict, disagreement_of, judged, surface_points
+from distrace.fitting.judge import Verdict, judged
 from distrace.fitting.proposals import proposed, proposed_codes
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
 from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample, Start
@@ -20,7 +20,6 @@ from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
-JUDGED_POINTS = 500
 SOLVER = SolverConfig(damping=1e-2, settled=1e-3)
 EQUAL = 0.15  # of the least loss: an end that is no worse by more may be right as well
 
@@ -92,9 +91,7 @@ def _fitted(decoder: Decoder, scan: Scan, prior: Prior, ends: Ends, began: float
     sdf = decoder.field(codes[0])
     equal = [k for k, loss in enumerate(ends.losses) if k and loss <= (1 + EQUAL) * least]
     others = tuple((codes[k], ends.states[k].place) for k in equal)
-    surface = best.place.to_world(surface_points(sdf, JUDGED_POINTS, scan.points))
-    disagreement = disagreement_of(surface, best.place, [(decoder.field(code), place) for code, place in others])
-    verdict = judged(scan, sdf, best.place, disagreement)
+    verdict = judged(scan, sdf, best.place, [(decoder.field(code), place) for code, place in others])
     seconds = time.perf_counter() - began
     return ScanFit(codes[0], best.place, least, verdict, ends.curves, ends.evaluations, seconds, others)
 

@@ -52,10 +52,15 @@ class Verdict:
 
 @torch.no_grad()
 def judged(
-    scan: Scan, sdf: SDF, place: Similarity, disagreement: float = 0.0, silhouette: float | None = None
+    scan: Scan,
+    sdf: SDF,
+    place: Similarity,
+    others: Sequence[tuple[SDF, Similarity]] = (),
+    silhouette: float | None = None,
 ) -> Verdict:
-    """Returns the verdict on a placed shape. `disagreement` is that of the other ends: `disagreement_of`."""
+    """Returns the verdict on a placed shape; `others` are the placed shapes of fits that are nearly as good."""
     surface = surface_points(sdf, SURFACE_POINTS, scan.points)
+    disagreement = disagreement_of(place.to_world(surface), place, others)
     reach = _reach(surface)
     noise = 2 * min(scan.noise / float(place.scale), MOST_NOISE * reach)
     away = distances(scan.points, sdf, place) - noise
