@@ -18,7 +18,7 @@ from distrace.cli.common import save_code
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
 from distrace.data.scan import canonical_scan
-from distrace.data.scan_files import read_scan, save_scan
+from distrace.data.saved_scan import read_scan, save_scan
 from distrace.fields import primitives
 from distrace.pose import Similarity
 from distrace.viewer.image import LAYERS, Image

@@ -17,7 +17,7 @@ from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.data.scan import canonical_scan
-from distrace.data.scan_files import save_scan
+from distrace.data.saved_scan import save_scan
 from distrace.files import save_text
 from distrace.fitting.completing import complete_shape, plausible, spread
 from distrace.fitting.fit import FitConfig

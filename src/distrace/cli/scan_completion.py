@@ -12,7 +12,7 @@ from distrace.checkpoints.model import Model
 from distrace.cli.common import chamfer_facts, save_code, save_completed
 from distrace.cli.console import Run, console, progress
 from distrace.data.scan import Scan
-from distrace.data.scan_files import save_scan
+from distrace.data.saved_scan import save_scan
 from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
 from distrace.fitting.judge import Verdict

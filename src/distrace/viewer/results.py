@@ -16,7 +16,7 @@ from distrace.data.observation import read_view
 from distrace.data.photo_readers.transforms import read_cameras
 from distrace.data.placement import placement_of
 from distrace.data.scan import Scan
-from distrace.data.scan_files import read_scan
+from distrace.data.saved_scan import read_scan
 from distrace.errors import explained
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.scan_residuals import PlacedCode
