@@ -10,6 +10,7 @@ EXTRAS = {
     "matplotlib": "report",
     "plotly": "report",
     "OpenEXR": "scans",
+    "viser": "view",
 }
 
 

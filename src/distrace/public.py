@@ -25,6 +25,7 @@ from distrace.surface import attach, clearance, footprint_normals, normals
 from distrace.tracing.bounds import Occupancy
 from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig, sphere_trace
 from distrace.tracing.tracer import TracerConfig
+from distrace.viewer.page import view
 
 __all__ = [
     "SDF",
@@ -76,4 +77,5 @@ __all__ = [
     "save_model",
     "shade",
     "sphere_trace",
+    "view",
 ]

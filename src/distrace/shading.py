@@ -74,18 +74,26 @@ def shaded_picture(
     normal: Float[Array, "height width 3"],
     mask: Bool[Array, "height width"],
     directions: Float[Array, "height width 3"],
+    light: Float[np.ndarray, "3"] | None = None,
 ) -> Picture:
-    """Clay in the light of a sky, a head lamp and a soft key light from the upper left, with a slight rim.
+    """Clay in the light of a sky, a head lamp and a soft key light, with a slight rim.
 
-    Normals and ray directions are in world axes, y up.
+    Normals and ray directions are in world axes, y up. `light` is the direction to the key light; by default it is
+    over the camera's left shoulder.
     """
     n, towards = _numpy(normal).astype(float), -_numpy(directions).astype(float)
     facing = np.clip((n * towards).sum(-1), 0, 1)
-    key = np.clip((n @ _key_light(towards) + 0.25) / 1.25, 0, 1) ** 1.4  # wraps around the edge of the shadow
+    to_light = _key_light(towards) if light is None else _unit(light)
+    key = np.clip((n @ to_light + 0.25) / 1.25, 0, 1) ** 1.4  # wraps around the edge of the shadow
     sky = 0.5 + 0.5 * n[..., 1]
     rim = (1 - facing) ** 4 * sky
-    light = 0.04 + 0.18 * sky + 0.20 * facing + 0.80 * key + 0.25 * rim
-    return _over_white((light[..., None] * CLAY) ** (1 / 2.2), _numpy(mask))
+    brightness = 0.04 + 0.18 * sky + 0.20 * facing + 0.80 * key + 0.25 * rim
+    return _over_white((brightness[..., None] * CLAY) ** (1 / 2.2), _numpy(mask))
+
+
+def heat_picture(values: Float[Array, "height width"], mask: Bool[Array, "height width"]) -> Picture:
+    """Values from 0, violet, to 1, yellow, within the mask; beyond they are cut off."""
+    return _over_white(_mapped("viridis", np.clip(_numpy(values), 0, 1)), _numpy(mask))
 
 
 def error_picture(difference: Float[Array, "height width"], limit: float) -> Picture:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoints.model import Model, load_model
-from distrace.cli.console import console
+from distrace.checkpoints.model import Model, bundled_models, load_model
+from distrace.cli.console import Run, console
 from distrace.files import save_arrays, save_json, written
 from distrace.metrics import Chamfer
 from distrace.pose import Similarity
@@ -35,6 +35,9 @@ Views = Annotated[
         metavar="VIEWS",
         help="a folder with views.json, transforms.json, cameras_sphere.npz, *_par.txt, or COLMAP's sparse/",
     ),
+]
+CodeName = Annotated[
+    str, tyro.conf.arg(metavar="CODE", help="a training shape's number or name, or a code.npy that a command wrote")
 ]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
 
@@ -67,6 +70,13 @@ class Every:
 
 def opened(name: str, device: torch.device) -> Model:
     return load_model(name).to(device)
+
+
+def opened_for(run: Run, name: str) -> Model:
+    """Loads the model that a result is of; `result.json` says where it is."""
+    model = opened(name, run.device)
+    run.model = name if name in bundled_models() else str(Path(name).resolve())
+    return model
 
 
 def check_distance(distance: float | None) -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from distrace.cli.common import NONE, Flag, ModelName, default, opened
+from distrace.cli.common import NONE, Flag, ModelName, default, opened_for
 from distrace.cli.completion import Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
@@ -103,7 +103,7 @@ class Complete:
         scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box, self.poses))
         scan = scan if self.points is None else scan.sparse(self.points, self.seed)
         truth = None if self.reference is None else _reference(self.reference)
-        return complete_scan(run, ScanTask(opened(self.model, run.device), scan, truth, mesh, self.seed))
+        return complete_scan(run, ScanTask(opened_for(run, self.model), scan, truth, mesh, self.seed))
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
         if len(self.inputs) > 1:
@@ -120,7 +120,7 @@ class Complete:
         known = full if self.points is None else full.sparse(self.points, self.seed)
         self._check(path, known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
-        return complete(run, Task(opened(self.model, run.device), full, known, truth, fit, mesh, self.plausible))
+        return complete(run, Task(opened_for(run, self.model), full, known, truth, fit, mesh, self.plausible))
 
     def _check(self, path: Path, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
         """Raises `ValueError` where nothing that the solver uses is left."""
@@ -148,7 +148,7 @@ class Demo:
         known = full.sparse(DEMO_POINTS, self.seed).without("normal")
         fit = CodeFitConfig(seed=self.seed)
         mesh = MeshConfig(128, device=run.device)
-        complete(run, Task(opened("sofas", run.device), full, known, truth, fit, mesh))
+        complete(run, Task(opened_for(run, "sofas"), full, known, truth, fit, mesh))
 
 
 def _reference(path: Path) -> "trimesh.Trimesh | np.ndarray":

@@ -16,6 +16,7 @@ from distrace.cli.common import chamfer_facts, save_code, save_completed, save_m
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
+from distrace.data.saved_scan import save_scan
 from distrace.data.scan import canonical_scan
 from distrace.files import save_text
 from distrace.fitting.completing import complete_shape, plausible, spread
@@ -78,6 +79,7 @@ def complete(run: Run, task: Task) -> Verdict:
     with progress("fitting", task.fit.total) as bar:
         fit = complete_shape(task.model, task.known, task.fit, lambda done: bar.advance(to=done))
     save_code(run.out, fit.code, Similarity.identity())
+    save_scan(run.out / "scan.npz", canonical_scan(task.known))
     outcome = _outcome(task, fit)
     save_completed(run.out, outcome.mesh)
     for number, code in enumerate(outcome.others, 1):

@@ -53,6 +53,7 @@ class Run:
     device: torch.device
     began: float = field(default_factory=time.perf_counter)
     warnings: list[str] = field(default_factory=list)  # sentences
+    model: str | None = None  # that the result is of, so that other commands can load it
 
     def warn(self, sentence: str) -> None:
         """Prints a sentence on stderr, once, and keeps it for `result.json`."""
@@ -89,7 +90,10 @@ class Run:
         common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
         if "evaluations" in facts:
             common["setup_evaluations"] = 0  # unless facts say otherwise
-        content = {**common, "version": distrace.__version__, "warnings": self.warnings, **facts}
+        about = {"version": distrace.__version__, "command": " ".join(sys.argv), "warnings": self.warnings}
+        if self.model is not None:
+            about["model"] = self.model
+        content = {**common, **about, **facts}
         save_json(self.out / "result.json", content)
         for line in lines:
             console.print(line)

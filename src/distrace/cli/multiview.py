@@ -10,8 +10,9 @@ import torch
 import tyro
 
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Flag, ModelName, Views, opened, save_mesh
+from distrace.cli.common import Flag, ModelName, Views, opened_for, save_mesh
 from distrace.cli.console import console, progress, start
+from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
@@ -50,7 +51,7 @@ class Multiview:
     def run(self) -> None:
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
-        model = opened(self.model, run.device)
+        model = opened_for(run, self.model)
         found = load_photographs(self.views)
         console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}")
         for note in notes(found):
@@ -77,6 +78,10 @@ class Multiview:
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
+        save_cameras(
+            run.out / "transforms.json",
+            {view.name: found.placement.camera_to_world(view.camera) for view in found.views},
+        )
         run.finish(
             {
                 "loss": last.loss,

@@ -10,12 +10,12 @@ import tyro
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoints.model import Model
-from distrace.cli.common import NONE, Flag, ModelName, check_distance, default, opened
+from distrace.checkpoints.codes import named_code
+from distrace.cli.common import NONE, CodeName, Flag, ModelName, check_distance, default, opened_for
 from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
-from distrace.errors import explained
 from distrace.fields.base import SDF
+from distrace.files import written
 from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error
 from distrace.render import render
@@ -35,7 +35,7 @@ class Pose:
     model: tyro.conf.Positional[ModelName]
     observation: tyro.conf.Positional[Annotated[Path, tyro.conf.arg(metavar="OBSERVATION.npz")]]
     out: Path = Path("out/pose")
-    code: str = "0"  # number of the training shape, or a code.npy that `complete` wrote
+    code: CodeName = "0"
     ignore: Annotated[tuple[Literal["depth", "mask", "normal"], ...], NONE] = ()  # parts of the observation
     focal: Flag = False  # also find the focal length
     azimuth: Annotated[float | None, default("the observation's camera", "FLOAT")] = None
@@ -48,9 +48,9 @@ class Pose:
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        model = opened(self.model, run.device)
+        model = opened_for(run, self.model)
         observed = read_view(self.observation, self.ignore).to(run.device)
-        field = model.field(_code(model, self.code))
+        field = model.field(named_code(model, self.code))
         first = replace(observed.camera, T_world_camera=self._initial_pose(observed.camera))
         steps = []
         with progress("fitting", STEPS) as bar:
@@ -64,6 +64,8 @@ class Pose:
                 f"{self.observation}: no camera was found, for the loss is {last.loss}; is its camera right?"
             )
         save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
+        with written(run.out / "code.npy") as file:
+            np.save(file, field.code.cpu().numpy())
         chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
         self._finish(run, observed, steps)
@@ -102,16 +104,6 @@ class Pose:
             f"{last.off:.1%} of the rays disagree; difference from the observation's camera: {degrees:.3f}°,"
             f" {percent:.3f} % of the distance, {focal:.3f} % of the focal length",
         )
-
-
-def _code(model: Model, given: str) -> int | torch.Tensor:
-    if given.isdecimal():
-        return int(given)
-    with explained(f"--code {given} is neither the number of a training shape nor a code.npy"):
-        code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
-        if not code.isfinite().all():
-            raise ValueError("it has values that are not finite")
-        return code
 
 
 def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.Picture:

@@ -12,6 +12,7 @@ import torch
 
 from distrace.cli.common import save_mesh
 from distrace.cli.console import Run, device_name
+from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
@@ -52,6 +53,8 @@ class Reconstructed:
         mesh.vertices = self.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
         save_mesh(run.out / "mesh.ply", mesh)
         rows = self._rows(held_out)
+        refined = {view.name: self.placement.camera_to_world(view.camera) for view in self._refined}
+        save_cameras(run.out / "transforms.json", refined)
         run.finish(
             {
                 "rows": rows,

@@ -11,6 +11,7 @@ from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.cli.common import chamfer_facts, save_code, save_completed
 from distrace.cli.console import Run, console, progress
+from distrace.data.saved_scan import save_scan
 from distrace.data.scan import Scan
 from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
@@ -52,6 +53,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     fit = _fitted(task)
     place = fit.place.to("cpu")
     save_code(run.out, fit.code, place)
+    save_scan(run.out / "scan.npz", task.scan)
     mesh = extract_mesh(task.model.field(fit.code), task.mesh)
     mesh.apply_transform(place.T_world_object.double().numpy())
     save_completed(run.out, mesh)

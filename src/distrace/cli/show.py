@@ -10,7 +10,18 @@ import torch
 import tyro
 
 from distrace.camera import Camera
-from distrace.cli.common import Flag, ModelName, Orbit, default, opened, save_buffers, save_mesh, save_pictures
+from distrace.checkpoints.codes import named_code
+from distrace.cli.common import (
+    CodeName,
+    Flag,
+    ModelName,
+    Orbit,
+    default,
+    opened_for,
+    save_buffers,
+    save_mesh,
+    save_pictures,
+)
 from distrace.cli.console import progress, start
 from distrace.data.observation import View as Observation
 from distrace.data.observation import save_view
@@ -53,7 +64,7 @@ class Render(Orbit):
 
     model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/render")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
     orbit: Annotated[int | None, default("no movie", "INT")] = None
     """frames of a movie (MP4 and GIF) that turns once around the vertical axis"""
     strategy: Literal["parallel", "dynamic", "aggressive", "coarse_to_fine", "fast"] = "fast"
@@ -68,7 +79,8 @@ class Render(Orbit):
         run = start(self.out, self.device)
         camera = self.camera().to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
-        counted = Counted(opened(self.model, run.device).field(self.code))
+        model = opened_for(run, self.model)
+        counted = Counted(model.field(named_code(model, self.code)))
         with torch.no_grad(), run.noticing():
             views = self._saving_first(filmed(counted, cameras, config=self._config()), camera)
             tallies = (
@@ -138,13 +150,14 @@ class Mesh:
 
     model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/mesh")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
     resolution: int = 256  # cells along each side of the cube around the unit sphere
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        counted = Counted(opened(self.model, run.device).field(self.code))
+        model = opened_for(run, self.model)
+        counted = Counted(model.field(named_code(model, self.code)))
         with run.noticing():
             surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
         save_mesh(run.out / "mesh.ply", surface)

@@ -62,13 +62,16 @@ def fit_scan(
     config: ScanFitConfig = ScanFitConfig(),
     place: Similarity | None = None,
     progress: Progress | None = None,
+    start: PlacedCode | None = None,
 ) -> ScanFit:
-    """Fits code and placement. A `place` that is given is kept."""
+    """Fits code and placement. A `place` that is given is kept; a `start` is the only one."""
     began = time.perf_counter()
     quick = fastest(decoder)
     random = torch.Generator().manual_seed(config.seed)
     count = config.rounds[0].starts
-    if place is None:
+    if start is not None:
+        states = [start]
+    elif place is None:
         states = proposed(scan, quick, prior, count, config.seed)
     else:
         states = proposed_codes(scan, place, quick, prior, count, config.seed)

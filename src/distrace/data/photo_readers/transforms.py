@@ -1,15 +1,19 @@
 """`transforms.json`, as NeRF (Mildenhall et al., ECCV 2020), instant-ngp and nerfstudio write it."""
 
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
+from distrace.camera import Camera
 from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, file_of, listed, matrix, read_json
 from distrace.data.pictures import picture_size
 from distrace.data.placement import MAX_COORDINATE
 from distrace.errors import about
+from distrace.files import save_json
 
 NAMES = ("transforms.json", "transforms_train.json")
 UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # if terms are zero
@@ -89,3 +93,38 @@ def _number(entry: dict[str, Any], name: str) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MAX_COORDINATE:
         raise ValueError(f"{name} is {value!r}; a number is needed")
     return float(value)
+
+
+def save_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Writes the cameras of images, by the names of their files, as other tools read them."""
+    frames = []
+    for name, camera in cameras.items():
+        intrinsics = camera.intrinsics.tolist()
+        pose = camera.T_world_camera.cpu().double().numpy() @ OPENGL
+        frames.append(
+            {
+                "file_path": name,
+                "w": camera.width,
+                "h": camera.height,
+                "fl_x": intrinsics[0][0],
+                "fl_y": intrinsics[1][1],
+                "cx": intrinsics[0][2],
+                "cy": intrinsics[1][2],
+                "transform_matrix": pose.tolist(),
+            }
+        )
+    save_json(path, {"camera_model": "PINHOLE", "frames": frames})
+
+
+def read_cameras(path: Path) -> list[Camera]:
+    """Reads the cameras alone, without their images. Raises `ValueError` as `read` does."""
+    content = read_json(path)
+    cameras = []
+    for number, entry in enumerate(listed(content, "frames", path)):
+        with about(f"{path}: frames[{number}]"):
+            frame = content | entry
+            size = (int(_number(frame, "h")), int(_number(frame, "w")))
+            pose = matrix(frame, "transform_matrix", 4, 4) @ OPENGL
+            intrinsics = torch.from_numpy(_intrinsics(frame, *size)).float()
+            cameras.append(Camera.from_matrices(intrinsics, torch.from_numpy(pose).float(), *size))
+    return cameras

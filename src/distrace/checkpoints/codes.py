@@ -1,0 +1,38 @@
+"""Codes as a user names them: a number, a shape's name, or a file."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.checkpoints.model import Model
+from distrace.errors import explained
+
+
+def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
+    """Returns a code by the number or the name of its training shape, or from a `code.npy` that a command wrote.
+
+    Raises `ValueError`, in one sentence, for anything else.
+    """
+    if given.isdecimal():
+        number = int(given)
+        model.field(number)  # raises for a number that the model has not
+        return model.codes[number]
+    if not given.endswith(".npy"):
+        return model.code_of(given)
+    with explained(f"{given} is no code that a command wrote", Path(given)):
+        code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
+        if code.shape != model.codes.shape[1:]:
+            length = model.codes.shape[1]
+            raise ValueError(f"it has the shape {list(code.shape)}, and codes of {model.name} have {length} values")
+        if not code.isfinite().all():
+            raise ValueError("it has values that are not finite")
+    return code
+
+
+def code_title(model: Model, given: str) -> str:
+    """Returns what to call a code: the model, and the shape or the file."""
+    shape = model.shapes[int(given)] if given.isdecimal() else given
+    return f"{model.name}, {shape}"

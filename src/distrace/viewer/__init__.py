@@ -1,0 +1,1 @@
+"""A viewer in the browser: a shape that is traced live, on loopback."""

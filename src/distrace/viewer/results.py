@@ -1,0 +1,118 @@
+"""Opens what the viewer shows: a model, or the folder that a command wrote."""
+
+import json
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.checkpoints.codes import code_title, named_code
+from distrace.checkpoints.model import load_model
+from distrace.data.observation import read_view
+from distrace.data.photo_readers.transforms import read_cameras
+from distrace.data.placement import placement_of
+from distrace.data.saved_scan import read_scan
+from distrace.data.scan import Scan
+from distrace.errors import explained
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.fitting.scan_residuals import PlacedCode
+from distrace.pose import Similarity
+from distrace.prior import prior_of
+from distrace.reconstruction.networks import SurfaceNetwork, SurfaceSpecs
+from distrace.viewer.scene import Progress, Refit, Scene, model_scene
+
+
+def open_scene(name: str, code: str = "0", device: str | torch.device = "cpu") -> Scene:
+    """Opens a bundled model, a folder of a model, or the `--out` folder of another command.
+
+    `code` is a shape of a model: its number, its name, or a `code.npy`. Raises `ValueError`, in one sentence, for
+    anything else.
+    """
+    folder = Path(name)
+    if (folder / "result.json").is_file() and not (folder / "specs.json").is_file():
+        return _result(folder, torch.device(device))
+    model = load_model(name).to(device)
+    return model_scene(model, named_code(model, code), code_title(model, code))
+
+
+def _result(folder: Path, device: torch.device) -> Scene:
+    path = folder / "result.json"
+    with explained(f"{path} is not the result of a command", path):
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        name = content.get("model")
+    if (folder / "checkpoint.pt").is_file():
+        return _reconstruction(folder, content, device)
+    if not (folder / "code.npy").is_file() or name is None:
+        raise ValueError(f"{folder} holds no shape; give a model, or what complete, pose or multiview wrote")
+    model = load_model(name).to(device)
+    code = named_code(model, str(folder / "code.npy"))
+    scene = model_scene(model, code, f"{folder.name}, a shape of {model.name}")
+    if (folder / "scan.npz").is_file():
+        return _completion(folder, scene)
+    if (folder / "posed.npz").is_file():
+        view = read_view(folder / "posed.npz")
+        return replace(scene, points=view.points(), cameras=(view.camera,))
+    return replace(scene, cameras=_photographed(folder, content))
+
+
+def _completion(folder: Path, scene: Scene) -> Scene:
+    scan, cameras = read_scan(folder / "scan.npz")
+    place = _placement(folder / "placement.json")
+    in_object = [place.camera_in_object(camera) for camera in cameras]
+    return replace(scene, points=place.to_object(scan.points), cameras=in_object, refit=_refit(scene, scan, place))
+
+
+def _refit(scene: Scene, scan: Scan, place: Similarity) -> Refit:
+    """Returns the last round of a fit, from any code, at the placement that was found."""
+    model = scene.model
+    assert model is not None
+    config = ScanFitConfig(rounds=ScanFitConfig().rounds[-1:])
+
+    def refit(code: Float[Tensor, "length"], progress: Progress) -> Float[Tensor, "length"]:
+        prior = prior_of(model.codes)
+        start = PlacedCode(0, code, prior.mean[:0], place.to(code.device))
+        here = scan.to(code.device)
+
+        def report(done: int) -> None:
+            progress(done, config.total)
+
+        return fit_scan(model.decoder, here, prior, config, start.place, report, start).code
+
+    return refit
+
+
+def _photographed(folder: Path, content: dict[str, Any]) -> list[Camera]:
+    """Returns the cameras of `multiview`, in the object's frame."""
+    if not (folder / "transforms.json").is_file():
+        return []
+    path = folder / "result.json"
+    with explained(f"{path} does not say where the object is", path):
+        sphere = content["unit_sphere"]
+        unit = placement_of(sphere["centre"], sphere["radius"])
+        place = Similarity.from_matrix(torch.tensor(content["T_unit_object"]))
+    cameras = read_cameras(folder / "transforms.json")
+    return [place.camera_in_object(unit.camera_to_unit(camera)) for camera in cameras]
+
+
+def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device) -> Scene:
+    path = folder / "checkpoint.pt"
+    names = {each.name for each in fields(SurfaceSpecs)}
+    with explained(f"{path} is not the checkpoint of a reconstruction", path):
+        settings = json.loads((folder / "config.json").read_text(encoding="utf-8"))
+        surface = SurfaceNetwork(SurfaceSpecs(**{key: value for key, value in settings.items() if key in names}))
+        surface.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["surface"])
+        sphere = content["unit_sphere"]
+        unit = placement_of(sphere["centre"], sphere["radius"])
+    cameras: list[Camera] = []
+    if (folder / "transforms.json").is_file():
+        cameras = [unit.camera_to_unit(camera) for camera in read_cameras(folder / "transforms.json")]
+    return Scene(f"{folder.name}, a reconstruction", surface.requires_grad_(False).eval(), cameras=cameras)
+
+
+def _placement(path: Path) -> Similarity:
+    with explained(f"{path} is not the placement of a completion", path):
+        return Similarity.from_matrix(torch.tensor(json.loads(path.read_text(encoding="utf-8"))["T_input_object"]))

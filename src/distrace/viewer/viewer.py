@@ -1,0 +1,174 @@
+"""The page: a server on loopback, what it shows, and what it saves."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from torch import Tensor
+
+from distrace.camera import Camera
+from distrace.files import save_text, written
+from distrace.mesh import MeshConfig, extract_mesh
+from distrace.optional import require
+from distrace.prior import prior_of
+from distrace.shading import save_png
+from distrace.viewer.live import LiveView, Shown, camera_of
+from distrace.viewer.scene import Scene
+
+if TYPE_CHECKING:
+    import trimesh
+    from viser import CameraHandle, ClientHandle
+
+HOST = "127.0.0.1"  # only this machine can open the page
+EYE = (2.35, 1.7, 4.05)  # of the first camera, in radii
+FIELD_OF_VIEW = 0.52  # radians, from the bottom to the top
+MESH_CELLS = 96  # along each side, of the mesh on the page …
+SAVED_CELLS = 256  # … and of the one that is saved
+SAVED_ROWS = 512  # of the saved picture
+BLUE = (44, 104, 190)
+ORANGE = (226, 112, 32)
+CLAY = (203, 192, 180)
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Keeps viser's own lines from the terminal."""
+    import rich
+
+    console = rich.get_console()
+    before = console.quiet
+    console.quiet = True
+    try:
+        yield
+    finally:
+        console.quiet = before
+
+
+class Viewer:
+    """A page on http://127.0.0.1 that shows a scene; it works in threads of its own until `close`."""
+
+    def __init__(self, scene: Scene, out: str | Path = "out/view", port: int = 8080) -> None:
+        require("the viewer", "viser")
+        import viser
+
+        from distrace.viewer.controls import Controls
+
+        self.out = Path(out)
+        self.shown = Shown(scene)
+        self.prior = None if scene.model is None else prior_of(scene.model.codes)
+        self.views: dict[int, LiveView] = {}
+        self.changing = Lock()
+        with quiet():
+            self.server = viser.ViserServer(host=HOST, port=port, label="distrace", verbose=False)
+        self._set_stage(scene)
+        self.controls = Controls(self)
+        self.server.on_client_connect(self._connected)
+        self.server.on_client_disconnect(self._disconnected)
+
+    @property
+    def address(self) -> str:
+        """Where the page is."""
+        return f"http://{HOST}:{self.server.get_port()}"
+
+    def close(self) -> None:
+        """Stops the server and all threads."""
+        for view in list(self.views.values()):
+            view.close()
+        with quiet():
+            self.server.stop()
+
+    def show(self, **changes: Any) -> None:
+        """Shows another scene, layer or light in all browsers."""
+        with self.changing:
+            self.shown = replace(self.shown, **changes)
+        for view in list(self.views.values()):
+            view.changed.set()
+
+    def show_code(self, code: Float[Tensor, "length"], title: str) -> None:
+        """Shows another shape of the model."""
+        scene = self.shown.scene
+        assert scene.model is not None
+        self.show(scene=replace(scene, title=title, code=code, sdf=scene.model.field(code)), occupancy=[])
+
+    def mesh(self, cells: int) -> "trimesh.Trimesh":
+        """Returns the mesh of what is shown. Raises `ValueError` where it has no surface."""
+        scene = self.shown.scene
+        return extract_mesh(scene.sdf, MeshConfig(cells, radius=scene.radius, device=scene.device))
+
+    def set_mesh(self, visible: bool) -> None:
+        """Adds the mesh of what is shown to the page, or takes it away."""
+        if not visible:
+            self.server.scene.remove_by_name("/mesh")
+            return
+        mesh = self.mesh(MESH_CELLS)
+        self.server.scene.add_mesh_simple("/mesh", np.asarray(mesh.vertices), np.asarray(mesh.faces), color=CLAY)
+
+    def save(self, handle: "CameraHandle | None") -> list[str]:
+        """Writes the mesh, the code, and the picture of a browser's camera; returns the names of the files."""
+        shown = self.shown
+        names = ["mesh.ply"]
+        with written(self.out / "mesh.ply") as file:
+            self.mesh(SAVED_CELLS).export(file, file_type="ply")
+        if shown.scene.code is not None:
+            names.append("code.npy")
+            with written(self.out / "code.npy") as file:
+                np.save(file, shown.scene.code.cpu().numpy())
+        if handle is not None:
+            names.append("picture.png")
+            picture, _ = shown.picture(shown.image(camera_of(handle, SAVED_ROWS)))
+            save_png(self.out / "picture.png", picture)
+        return names
+
+    def save_page(self, path: str | Path) -> None:
+        """Writes a page that needs no server: the mesh, the observed points and the cameras."""
+        self.set_mesh(True)
+        save_text(path, self.server.scene.as_html())
+
+    def _set_stage(self, scene: Scene) -> None:
+        """Places the first camera, and what the shape was fitted to."""
+        stage = self.server.scene
+        stage.set_up_direction("+y")
+        stage.configure_environment_map(None)
+        self.server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would leave the machine
+        start = self.server.initial_camera
+        start.position = tuple(scene.radius * np.array(EYE))
+        start.look_at = (0.0, 0.0, 0.0)
+        start.fov = FIELD_OF_VIEW
+        if scene.points is not None:
+            points = scene.points.cpu().numpy()
+            stage.add_point_cloud("/points", points, ORANGE, point_size=0.012 * scene.radius, point_shape="circle")
+        if scene.cameras:
+            stage.add_frame("/cameras", show_axes=False)
+        for number, camera in enumerate(scene.cameras):
+            self._add_camera(f"/cameras/{number}", camera)
+
+    def _add_camera(self, name: str, camera: Camera) -> None:
+        from viser.transforms import SO3
+
+        pose = camera.T_world_camera.cpu().double().numpy()
+        self.server.scene.add_camera_frustum(
+            name,
+            fov=2 * float(np.arctan(camera.height / 2 / float(camera.intrinsics[1, 1]))),
+            aspect=camera.width / camera.height,
+            scale=0.15,
+            color=BLUE,
+            wxyz=SO3.from_matrix(pose[:3, :3]).wxyz,
+            position=pose[:3, 3],
+        )
+
+    def _connected(self, client: "ClientHandle") -> None:
+        aspect = client.camera.aspect
+        if aspect < 1:  # a phone: from so far that the whole shape is seen
+            client.camera.position = np.array(self.server.initial_camera.position) / aspect
+            client.camera.look_at = np.zeros(3)
+        self.views[client.client_id] = LiveView(client, lambda: self.shown, self.controls.report)
+
+    def _disconnected(self, client: "ClientHandle") -> None:
+        view = self.views.pop(client.client_id, None)
+        if view is not None:
+            view.close()
