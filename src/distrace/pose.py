@@ -119,13 +119,14 @@ class Similarity(ByValue):
     @staticmethod
     def from_matrix(T_world_object: Float[Tensor, "4 4"]) -> "Similarity":
         """Returns the similarity of a matrix. Raises `ValueError` for one that is none."""
-        block = T_world_object[:3, :3].double()
-        scale = block.norm() / math.sqrt(3)
-        rotation = block / scale
-        off = (rotation @ rotation.T - torch.eye(3).to(rotation)).abs().max()
-        if T_world_object.shape != (4, 4) or not off < 1e-3 or not torch.linalg.det(rotation) > 0:
+        gram = T_world_object[:3, :3].T @ T_world_object[:3, :3]
+        scale = (gram.diagonal().sum() / 3).sqrt()
+        rotation = T_world_object[:3, :3] / scale
+        off = (rotation.T @ rotation - torch.eye(3).to(rotation)).abs().max()
+        mirrored = torch.cross(rotation[:, 0], rotation[:, 1], dim=0) @ rotation[:, 2] < 0
+        if T_world_object.shape != (4, 4) or not off < 1e-3 or mirrored:
             raise ValueError("the matrix is not a rotation times a positive scale, and a translation")
-        return Similarity(rotation.to(T_world_object), T_world_object[:3, 3], scale.to(T_world_object))
+        return Similarity(rotation, T_world_object[:3, 3], scale)
 
     def to(self, device: torch.device | str) -> "Similarity":
         return Similarity(self.rotation.to(device), self.translation.to(device), self.scale.to(device))

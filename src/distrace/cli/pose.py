@@ -50,7 +50,8 @@ class Pose:
         run = start(self.out, self.device)
         model = opened_for(run, self.model)
         observed = read_view(self.observation, self.ignore).to(run.device)
-        field = model.field(named_code(model, self.code))
+        code = named_code(model, self.code)
+        field = model.field(code)
         first = replace(observed.camera, T_world_camera=self._initial_pose(observed.camera))
         steps = []
         with progress("fitting", STEPS) as bar:
@@ -65,7 +66,7 @@ class Pose:
             )
         save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
         with written(run.out / "code.npy") as file:
-            np.save(file, field.code.cpu().numpy())
+            np.save(file, code.cpu().numpy())
         chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
         self._finish(run, observed, steps)
