@@ -3,8 +3,10 @@
 import json
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -13,20 +15,21 @@ from numpy.testing import assert_allclose
 
 import distrace as dt
 from distrace.camera import Camera
-from distrace.checkpoints.codes import named_code
-from distrace.cli.common import save_code
+from distrace.checkpoints.codes import save_code
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
-from distrace.data.saved_scan import read_scan, save_scan
+from distrace.data.saved_scan import save_scan
 from distrace.data.scan import canonical_scan
 from distrace.fields import primitives
 from distrace.pose import Similarity
 from distrace.viewer.image import LAYERS, Image
-from distrace.viewer.live import Shown
+from distrace.viewer.live import LiveView, Shown, TracedField
 from distrace.viewer.results import open_scene
-from distrace.viewer.scene import Scene
+from distrace.viewer.scene import Scene, field_scene
 
-viser = pytest.importorskip("viser")
+if TYPE_CHECKING:
+    from distrace.viewer.viewer import Viewer
+
 PORT = 18_080
 CAMERA = Camera.orbit(30, 20, 4.97, height=48, width=64)
 
@@ -34,7 +37,7 @@ CAMERA = Camera.orbit(30, 20, 4.97, height=48, width=64)
 def test_bands_are_the_rows_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("distrace.viewer.image.BAND", 640)
     sphere = primitives.sphere(0.5)
-    banded = Shown(Scene("sphere", sphere)).image(CAMERA)
+    banded = TracedField(Scene("sphere", sphere)).image(CAMERA)
     assert len(banded.bands) == 5
     whole = Image([dt.render(sphere, CAMERA)])
     assert (banded.mask != whole.mask).sum() <= 1
@@ -44,48 +47,17 @@ def test_bands_are_the_rows_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.parametrize("layer", LAYERS)
 def test_each_layer_is_a_picture_of_the_size(layer: str) -> None:
-    shown = Shown(Scene("sphere", primitives.sphere(0.5)), layer)
-    picture, legend = shown.picture(shown.image(CAMERA))
+    shown = Shown(TracedField(Scene("sphere", primitives.sphere(0.5))), layer)
+    picture, legend = shown.picture(shown.field.image(CAMERA))
     assert picture.shape == (48, 64, 3)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 3
     assert (legend == "") == (layer == "shaded")
 
 
 def test_light_falls_from_where_it_is() -> None:
-    shown = Shown(Scene("sphere", primitives.sphere(0.5)), light=np.array([1.0, 0.0, 0.0]))
-    picture, _ = shown.picture(shown.image(Camera.orbit(0, 0, 4.97, height=48, width=48)))
+    shown = Shown(TracedField(Scene("sphere", primitives.sphere(0.5))), light=np.array([1.0, 0.0, 0.0]))
+    picture, _ = shown.picture(shown.field.image(Camera.orbit(0, 0, 4.97, height=48, width=48)))
     assert picture[24, 29].sum() > picture[24, 19].sum() + 100
-
-
-@pytest.mark.parametrize(("given", "shape"), [("1", 1), ("beige-sofa-2-seats", 0)])
-def test_codes_by_number_and_name(given: str, shape: int) -> None:
-    model = dt.load_model("sofas")
-    assert named_code(model, given).equal(model.codes[shape])
-
-
-def test_codes_that_are_none_end_in_a_sentence(tmp_path: Path) -> None:
-    model = dt.load_model("sofas")
-    np.save(tmp_path / "short.npy", np.zeros(3))
-    for given, said in (("9999", "9999"), ("sofaa", "no shape"), (str(tmp_path / "short.npy"), "256 values")):
-        with pytest.raises(ValueError, match=said):
-            named_code(model, given)
-    with pytest.raises(ValueError, match=r"absent\.npy"):
-        named_code(model, str(tmp_path / "absent.npy"))
-
-
-def test_a_scan_is_read_back(tmp_path: Path) -> None:
-    sphere = dt.render(primitives.sphere(0.5), CAMERA)
-    scan = canonical_scan(View(CAMERA, sphere.depth, sphere.mask))
-    save_scan(tmp_path / "scan.npz", scan)
-    again, (camera,) = read_scan(tmp_path / "scan.npz")
-    assert again.points.equal(scan.points)
-    assert again.free_until.equal(scan.free_until)
-    assert again.noise == pytest.approx(scan.noise)
-    assert camera.T_world_camera.equal(CAMERA.T_world_camera)
-    assert (camera.height, camera.width) == (48, 64)
-    (tmp_path / "wrong.npz").write_bytes(b"no archive")
-    with pytest.raises(ValueError, match="no scan"):
-        read_scan(tmp_path / "wrong.npz")
 
 
 def completion(folder: Path, place: Similarity) -> None:
@@ -105,9 +77,10 @@ def test_a_completion_opens_in_the_frame_of_its_object(tmp_path: Path) -> None:
     assert scene.points is not None
     assert scene.refit is not None
     assert float(scene.sdf(scene.points).abs().max()) < 1e-3, "the points lie on the shape"
-    progress: list[int] = []
-    code = scene.refit(scene.code, lambda done, total: progress.append(done))
-    assert progress[-1] == len(progress)
+    progress: list[tuple[int, int]] = []
+    code, verdict = scene.refit(scene.code, lambda done, total: progress.append((done, total)))
+    assert progress == [(done, len(progress)) for done in range(1, len(progress) + 1)]
+    assert verdict.startswith(("trusted", "doubtful", "failed"))
     assert float(dt.load_model("sofas").field(code)(scene.points).abs().mean()) < 0.02
 
 
@@ -129,10 +102,95 @@ def test_a_folder_without_a_shape_is_refused(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("[")
     with pytest.raises(ValueError, match=r"result\.json"):
         open_scene(str(tmp_path))
+    (tmp_path / "result.json").write_text("{}")
+    np.save(tmp_path / "code.npy", np.zeros(256))
+    with pytest.raises(ValueError, match="names no model"):
+        open_scene(str(tmp_path))
+    with pytest.raises(ValueError, match="--code 3"):
+        open_scene(str(tmp_path), "3")
+
+
+class Ball(torch.nn.Module):
+    """A field whose radius requires grad."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.radius = torch.nn.Parameter(torch.tensor(3.0))
+
+    def forward(self, points: torch.Tensor) -> torch.Tensor:
+        return points.norm(dim=-1) - self.radius
+
+
+def test_a_field_of_any_radius_is_shown_in_the_unit_sphere() -> None:
+    scene = field_scene(Ball(), radius=6.0)
+    image = TracedField(scene).image(CAMERA)
+    assert image.depth[image.mask].min() == pytest.approx(4.97 - 0.5, abs=1e-2)
+    assert float(scene.place.scale) == 6.0
+    with pytest.raises(ValueError, match="radius of 0"):
+        field_scene(Ball(), radius=0)
+
+
+class PretendedClient:
+    """A browser with a camera, which keeps the pictures it was sent."""
+
+    def __init__(self) -> None:
+        self.client_id = 0
+        self.pictures: list[np.ndarray] = []
+        self.scene = self.camera = self
+        self.position = np.array([0.0, 0.0, 4.97])
+        self.wxyz = np.array([0.0, 1.0, 0.0, 0.0])  # looks along −z, y up
+        self.fov = 0.52
+        self.aspect = 1.0
+        self.image_height = 128
+
+    def on_update(self, callback: Callable[[object], None]) -> None:
+        self.moved = callback
+
+    def set_background_image(self, picture: np.ndarray, **_: object) -> None:
+        self.pictures.append(picture)
+
+
+def wait_until(is_done: Callable[[], bool]) -> None:
+    began = time.monotonic()
+    while not is_done():
+        assert time.monotonic() - began < 60
+        time.sleep(0.02)
+
+
+def test_pictures_get_finer_and_other_layers_are_not_traced_again() -> None:
+    client = PretendedClient()
+    shown = Shown(TracedField(field_scene(Ball(), radius=6.0)))
+    reports: list[str] = []
+    view = LiveView(client, lambda: shown, reports.append)  # pyright: ignore[reportArgumentType]
+    wait_until(lambda: len(client.pictures) == 2)
+    assert [len(picture) for picture in client.pictures] == [64, 128]
+    assert (client.pictures[-1][64, 64] < 240).all(), "the ball is in the middle"
+    assert (client.pictures[-1][2, 2] == 255).all()
+    counts = len(reports)
+    wait_until(lambda: not view.changed.is_set())
+    shown = Shown(shown.field, "depth")
+    view.changed.set()
+    wait_until(lambda: len(reports) > counts)
+    view.close()
+    assert [len(picture) for picture in client.pictures] == [64, 128, 128]
+    assert " s  " not in reports[-1], "no time was spent on tracing"
+
+
+def test_a_field_that_raises_becomes_a_sentence() -> None:
+    def wrong(points: torch.Tensor) -> torch.Tensor:
+        raise KeyError("no such layer")
+
+    reports: list[str] = []
+    shown = Shown(TracedField(Scene("wrong", wrong)))
+    view = LiveView(PretendedClient(), lambda: shown, reports.append)  # pyright: ignore[reportArgumentType]
+    wait_until(lambda: bool(reports))
+    view.close()
+    assert reports == ["This view cannot be traced: 'no such layer'"]
 
 
 @pytest.fixture
-def viewer(tmp_path: Path) -> Iterator["dt.viewer.viewer.Viewer"]:
+def viewer(tmp_path: Path) -> Iterator["Viewer"]:
+    pytest.importorskip("viser")
     from distrace.viewer.viewer import Viewer
 
     completion(tmp_path, Similarity.identity())
@@ -143,11 +201,31 @@ def viewer(tmp_path: Path) -> Iterator["dt.viewer.viewer.Viewer"]:
 
 def test_saves_what_is_shown_and_a_page_without_a_server(viewer, tmp_path: Path) -> None:
     assert viewer.address.startswith("http://127.0.0.1:")
-    viewer.show(layer="depth")
-    assert viewer.save(None) == ["mesh.ply", "code.npy"]
-    assert np.load(tmp_path / "saved" / "code.npy").shape == (256,)
+    viewer.set_layer("depth")
+    assert viewer.save(None) == tmp_path / "saved" / "saved-1"
+    assert viewer.save(None) == tmp_path / "saved" / "saved-2", "nothing is written over"
+    again = open_scene(str(tmp_path / "saved" / "saved-1"))
+    assert again.code is not None
+    assert again.code.equal(viewer.scene.code)
     viewer.save_page(tmp_path / "page.html")
     assert "<html" in (tmp_path / "page.html").read_text()[:2000].lower()
+
+
+def test_the_last_choice_is_what_stays(viewer: "Viewer") -> None:
+    controls = viewer.controls
+    event = SimpleNamespace(client=object())
+    model = viewer.scene.model
+    assert model is not None
+    for shape in (5, 6, 7):
+        controls._by_hand(event, lambda shape=shape: controls._set_code(model.codes[shape], str(shape)))  # pyright: ignore[reportArgumentType]
+    controls._by_hand(SimpleNamespace(client=None), lambda: pytest.fail("moved by the program"))  # pyright: ignore[reportArgumentType]
+    controls.worker.submit(lambda: None).result(60)
+    assert viewer.scene.code is not None
+    assert viewer.scene.code.equal(model.codes[7])
+    assert controls.sliders[0].value == pytest.approx(float(controls.prior.coordinates(model.codes[7])[0]), abs=0.01)
+    controls._submit(lambda: {}["absent"])
+    controls.worker.submit(lambda: None).result(60)
+    assert controls.message.content == "That failed: 'absent'"
 
 
 @pytest.mark.slow

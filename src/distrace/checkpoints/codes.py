@@ -7,8 +7,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.checkpoints.model import Model
+from distrace.checkpoints.model import Model, bundled_models
 from distrace.errors import explained
+from distrace.files import save_json, written
+from distrace.pose import Similarity
 
 
 def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
@@ -36,3 +38,16 @@ def code_title(model: Model, given: str) -> str:
     """Returns what to call a code: the model, and the shape or the file."""
     shape = model.shapes[int(given)] if given.isdecimal() else given
     return f"{model.name}, {shape}"
+
+
+def model_source(name: str) -> str:
+    """Returns where a model can be loaded from again: its bundled name, or its folder from the root."""
+    return name if name in bundled_models() else str(Path(name).resolve())
+
+
+def save_code(folder: Path, code: Float[Tensor, "length"], place: Similarity | None = None) -> None:
+    """Writes a code, and the placement of its shape in the frame of the input where there is one."""
+    with written(folder / "code.npy") as file:
+        np.save(file, code.detach().cpu().numpy())
+    if place is not None:
+        save_json(folder / "placement.json", {"T_input_object": place.T_world_object.tolist()})

@@ -6,18 +6,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import numpy as np
 import torch
 import tyro
-from torch import Tensor
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoints.model import Model, bundled_models, load_model
+from distrace.checkpoints.codes import model_source
+from distrace.checkpoints.model import Model, load_model
 from distrace.cli.console import Run, console
-from distrace.files import save_arrays, save_json, written
+from distrace.files import save_arrays, written
 from distrace.metrics import Chamfer
-from distrace.pose import Similarity
 from distrace.render import Buffers
 from distrace.report.completion_page import View
 from distrace.report.page import short
@@ -75,7 +73,7 @@ def opened(name: str, device: torch.device) -> Model:
 def opened_for(run: Run, name: str) -> Model:
     """Loads the model that a result is of; `result.json` says where it is."""
     model = opened(name, run.device)
-    run.model = name if name in bundled_models() else str(Path(name).resolve())
+    run.model = model_source(name)
     return model
 
 
@@ -133,13 +131,6 @@ def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
     """Writes a mesh in the format of the name: PLY or GLB."""
     with written(path) as file:
         mesh.export(file, file_type=path.suffix.removeprefix("."))
-
-
-def save_code(folder: Path, code: Tensor, place: Similarity) -> None:
-    """Writes a fitted code, and the placement of its shape in the frame of the input."""
-    with written(folder / "code.npy") as file:
-        np.save(file, code.cpu().numpy())
-    save_json(folder / "placement.json", {"T_input_object": place.T_world_object.tolist()})
 
 
 def save_completed(folder: Path, mesh: "trimesh.Trimesh") -> None:

@@ -11,8 +11,9 @@ from torch import Tensor
 from distrace import shading
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
+from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_code, save_completed, save_mesh
+from distrace.cli.common import chamfer_facts, save_completed, save_mesh
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 import tyro
 
+from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, ModelName, Views, opened_for, save_mesh
 from distrace.cli.console import console, progress, start
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
-from distrace.files import save_text, written
+from distrace.files import save_text
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import save_gif
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoFit, PhotoStep, fit_photos
@@ -73,8 +74,7 @@ class Multiview:
                 run.warn(_doubt(view))
         mesh = _mesh(model, last, found, resolved)
         save_mesh(run.out / "mesh.ply", mesh)
-        with written(run.out / "code.npy") as file:
-            np.save(file, last.code.cpu().numpy())
+        save_code(run.out, last.code)
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))

@@ -10,12 +10,11 @@ import tyro
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.checkpoints.codes import named_code
+from distrace.checkpoints.codes import named_code, save_code
 from distrace.cli.common import NONE, CodeName, Flag, ModelName, check_distance, default, opened_for
 from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
 from distrace.fields.base import SDF
-from distrace.files import written
 from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error
 from distrace.render import render
@@ -65,8 +64,7 @@ class Pose:
                 f"{self.observation}: no camera was found, for the loss is {last.loss}; is its camera right?"
             )
         save_view(run.out / "posed.npz", replace(observed, camera=last.camera))
-        with written(run.out / "code.npy") as file:
-            np.save(file, code.cpu().numpy())
+        save_code(run.out, code)
         chosen = [CameraStep(0, 0, first, 0, 0, 0, 0), *(step for step in steps if step.start == last.start)]
         shading.save_png(run.out / "filmstrip.png", _filmstrip(field, observed, chosen))
         self._finish(run, observed, steps)

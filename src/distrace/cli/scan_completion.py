@@ -8,8 +8,9 @@ import torch
 
 from distrace import shading
 from distrace.camera import Camera
+from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_code, save_completed
+from distrace.cli.common import chamfer_facts, save_completed
 from distrace.cli.console import Run, console, progress
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import Scan

@@ -23,7 +23,7 @@ class View:
     shown: tyro.conf.Positional[Annotated[str, tyro.conf.arg(metavar="MODEL|RESULT")]]
     """a model, or the --out folder of complete, pose, multiview or reconstruct"""
     out: Path = Path("out/view")  # where the page's button saves
-    code: CodeName = "0"
+    code: Annotated[CodeName | None, default("the first shape", "CODE")] = None
     port: int = 8080  # or the next one that is free
     save: Annotated[Path | None, default("none", "PAGE.html")] = None
     """write a page that needs no server, with the mesh and what was observed, and end"""
@@ -33,6 +33,8 @@ class View:
         require("the viewer", "viser")
         if not 0 < self.port < 65536:
             raise ValueError(f"--port {self.port} was given; a number from 1 to 65535 is needed")
+        if self.out.resolve() == Path(self.shown).resolve():
+            raise ValueError(f"--out {self.out} is the folder that is shown; give another to save to")
         run = start(self.out, self.device)
         scene = open_scene(self.shown, self.code, run.device)
         from distrace.viewer.viewer import Viewer

@@ -12,6 +12,7 @@ from distrace import shading
 from distrace.camera import Camera
 from distrace.render import Buffers
 from distrace.shading import Picture
+from distrace.tracing.sphere_tracing import Outcome
 
 BAND = 1 << 15  # pixels
 SHADED = "shaded"
@@ -62,12 +63,18 @@ class Image:
         return _joined(values)
 
     @property
+    def doubtful(self) -> int:
+        """Rays that ended without an answer, or start inside the solid."""
+        outcomes = _joined([band.trace.outcome for band in self.bands])
+        return int(np.isin(outcomes, [int(Outcome.EXHAUSTED), int(Outcome.INSIDE)]).sum())
+
+    @property
     def total_evaluations(self) -> int:
         return sum(band.trace.total_evaluations for band in self.bands)
 
 
 def _joined(parts: Sequence[torch.Tensor]) -> np.ndarray:
-    return torch.cat(list(parts)).cpu().numpy()
+    return torch.cat(list(parts)).detach().cpu().numpy()
 
 
 def _values(band: Buffers) -> torch.Tensor:

@@ -1,21 +1,20 @@
-"""Live pictures: a thread for each browser, which traces coarse images first, and anew when anything moves."""
+"""Live pictures: a thread for each browser, which traces coarse images first, and again when anything moves."""
 
 import math
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from threading import Event, Lock, Thread
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float
 
 from distrace.camera import Camera
 from distrace.render import Buffers, render
 from distrace.shading import Picture
 from distrace.tracing.bounds import Occupancy
-from distrace.viewer.image import LAYERS, SHADED, Image, bands
+from distrace.viewer.image import LAYERS, SHADED, Image, Light, bands
 from distrace.viewer.scene import Scene
 
 if TYPE_CHECKING:
@@ -23,30 +22,36 @@ if TYPE_CHECKING:
 
 HEIGHTS = (64, 128, 256, 512)  # rows of the pictures, one after the other, while nothing moves
 FAR = 100.0  # depth of the background in radii: behind everything
-TRACING = Lock()  # one picture at a time: each uses all cores
+TRACING = Lock()  # one band at a time: each uses all cores
 
 
-@dataclass
-class Shown:
-    """What all browsers see: a shape, a layer and a light. A change is a new object."""
+class TracedField:
+    """A scene's field, which is measured at the first picture, and then traced from any camera."""
 
-    scene: Scene
-    layer: str = SHADED
-    light: Float[np.ndarray, "3"] | None = None
-    occupancy: list[Occupancy] = field(default_factory=list)  # at most one, of the scene's field
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.occupancy: Occupancy | None = None
 
     @torch.no_grad()
     def trace(self, camera: Camera) -> Buffers:
-        """Traces an image, or a band of one; the field is measured only for the first one."""
-        known = self.occupancy[0] if self.occupancy else None
-        buffers = render(self.scene.sdf, camera.to(self.scene.device), radius=self.scene.radius, occupancy=known)
-        if buffers.occupancy is not None:
-            self.occupancy[:] = [buffers.occupancy]
+        """Traces an image, or a band of one."""
+        with TRACING:
+            buffers = render(self.scene.sdf, camera.to(self.scene.device), occupancy=self.occupancy)
+        self.occupancy = buffers.occupancy
         return buffers
 
     def image(self, camera: Camera) -> Image:
         """Traces a whole image."""
         return Image([self.trace(band) for band in bands(camera)])
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What all browsers see: a shape, a layer and the direction to a light. A change is a new object."""
+
+    field: TracedField
+    layer: str = SHADED
+    light: Light = None
 
     @torch.no_grad()
     def picture(self, image: Image) -> tuple[Picture, str]:
@@ -76,6 +81,7 @@ class LiveView:
         self.report = report
         self.changed = Event()
         self.closed = False
+        self.finished: tuple[TracedField, Camera, Image] | None = None  # the last whole picture
         client.camera.on_update(lambda _: self.changed.set())
         self.thread = Thread(target=self._run, name=f"distrace view {client.client_id}", daemon=True)
         self.changed.set()
@@ -90,32 +96,47 @@ class LiveView:
     def _run(self) -> None:
         while self.changed.wait() and not self.closed:
             self.changed.clear()
-            for height in HEIGHTS:
-                if height > max(self.client.camera.image_height, HEIGHTS[0]):
-                    break
-                self._trace(height)
-                if self.changed.is_set():
-                    break
+            try:
+                self._draw()
+            except Exception as error:  # a user's field may raise anything; the page goes on
+                self.report(f"This view cannot be traced: {error}")
 
-    def _trace(self, height: int) -> None:
-        """Sends one picture, unless the camera or the shape moves meanwhile; the coarsest one in any case."""
+    def _draw(self) -> None:
+        """Sends ever finer pictures until anything moves; draws the last one again where only its colours change."""
         shown = self.shown()
-        camera = camera_of(self.client.camera, height)
-        began = time.perf_counter()
+        heights = [height for height in HEIGHTS if height <= max(self.client.camera.image_height, HEIGHTS[0])]
+        if self.finished is not None:
+            field, camera, image = self.finished
+            if field is shown.field and camera == camera_of(self.client.camera, camera.height):
+                self._send(shown, camera, image, 0.0)
+                heights = [height for height in heights if height > camera.height]
+        for height in heights:
+            camera = camera_of(self.client.camera, height)
+            began = time.perf_counter()
+            image = self._traced(shown, camera)
+            if image is None:
+                return
+            self._send(shown, camera, image, time.perf_counter() - began)
+            self.finished = (shown.field, camera, image)
+            if self.changed.is_set():
+                return
+
+    def _traced(self, shown: Shown, camera: Camera) -> Image | None:
+        """Traces a picture; None where the camera or the shape moved meanwhile, unless it is the coarsest."""
         traced: list[Buffers] = []
-        try:
-            for band in bands(camera):
-                with TRACING:
-                    traced.append(shown.trace(band))
-                if self.closed or (self.changed.is_set() and height > HEIGHTS[0]):
-                    return
-            image = Image(traced)
-            picture, legend = shown.picture(image)
-        except (ValueError, RuntimeError) as error:
-            self.report(f"This view cannot be traced: {error}")
-            return
-        seconds = time.perf_counter() - began
+        for band in bands(camera):
+            traced.append(shown.field.trace(band))
+            if self.closed or (self.changed.is_set() and camera.height > HEIGHTS[0]):
+                return None
+        return Image(traced)
+
+    def _send(self, shown: Shown, camera: Camera, image: Image, seconds: float) -> None:
+        picture, legend = shown.picture(image)
         depth = np.nan_to_num(image.depth, posinf=FAR)
         self.client.scene.set_background_image(picture, format="jpeg", jpeg_quality=90, depth=depth)
-        size = f"{camera.width} × {camera.height}"
-        self.report(f"{size} pixels, {image.total_evaluations:,} evaluations, {seconds:.2f} s  \n{legend}")
+        words = [f"{camera.width} × {camera.height} pixels", f"{image.total_evaluations:,} evaluations"]
+        if seconds:
+            words.append(f"{seconds:.2f} s")
+        if image.doubtful:
+            words.append(f"{image.doubtful} rays without a reliable answer")
+        self.report(", ".join(words) + f"  \n{legend}")

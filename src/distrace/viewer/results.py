@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checkpoints.codes import code_title, named_code
+from distrace.checkpoints.codes import code_title, model_source, named_code
 from distrace.checkpoints.model import load_model
 from distrace.data.observation import read_view
 from distrace.data.photo_readers.transforms import read_cameras
@@ -26,17 +26,20 @@ from distrace.reconstruction.networks import SurfaceNetwork, SurfaceSpecs
 from distrace.viewer.scene import Progress, Refit, Scene, model_scene
 
 
-def open_scene(name: str, code: str = "0", device: str | torch.device = "cpu") -> Scene:
+def open_scene(name: str, code: str | None = None, device: str | torch.device = "cpu") -> Scene:
     """Opens a bundled model, a folder of a model, or the `--out` folder of another command.
 
-    `code` is a shape of a model: its number, its name, or a `code.npy`. Raises `ValueError`, in one sentence, for
-    anything else.
+    `code` is a shape of a model: its number, its name, or a `code.npy`; by default the first. Raises `ValueError`, in
+    one sentence, for anything else.
     """
     folder = Path(name)
     if (folder / "result.json").is_file() and not (folder / "specs.json").is_file():
+        if code is not None:
+            raise ValueError(f"--code {code} was given, and {folder} holds one shape; leave it out")
         return _result(folder, torch.device(device))
     model = load_model(name).to(device)
-    return model_scene(model, named_code(model, code), code_title(model, code))
+    code = "0" if code is None else code
+    return model_scene(model, named_code(model, code), code_title(model, code), model_source(name))
 
 
 def _result(folder: Path, device: torch.device) -> Scene:
@@ -46,11 +49,15 @@ def _result(folder: Path, device: torch.device) -> Scene:
         name = content.get("model")
     if (folder / "checkpoint.pt").is_file():
         return _reconstruction(folder, content, device)
-    if not (folder / "code.npy").is_file() or name is None:
+    if (folder / "code.npy").is_file() and name is None:
+        raise ValueError(f"{path} names no model, as those of earlier versions; run its command again")
+    if name is None:
         raise ValueError(f"{folder} holds no shape; give a model, or what complete, pose or multiview wrote")
     model = load_model(name).to(device)
     code = named_code(model, str(folder / "code.npy"))
-    scene = model_scene(model, code, f"{folder.name}, a shape of {model.name}")
+    scene = model_scene(model, code, f"{folder.name}, a shape of {model.name}", name)
+    if (folder / "placement.json").is_file():
+        scene = replace(scene, place=_placement(folder / "placement.json"))
     if (folder / "scan.npz").is_file():
         return _completion(folder, scene)
     if (folder / "posed.npz").is_file():
@@ -61,7 +68,7 @@ def _result(folder: Path, device: torch.device) -> Scene:
 
 def _completion(folder: Path, scene: Scene) -> Scene:
     scan, cameras = read_scan(folder / "scan.npz")
-    place = _placement(folder / "placement.json")
+    place = scene.place
     in_object = [place.camera_in_object(camera) for camera in cameras]
     return replace(scene, points=place.to_object(scan.points), cameras=in_object, refit=_refit(scene, scan, place))
 
@@ -70,17 +77,18 @@ def _refit(scene: Scene, scan: Scan, place: Similarity) -> Refit:
     """Returns the last round of a fit, from any code, at the placement that was found."""
     model = scene.model
     assert model is not None
+    prior = prior_of(model.codes)
     config = ScanFitConfig(rounds=ScanFitConfig().rounds[-1:])
 
-    def refit(code: Float[Tensor, "length"], progress: Progress) -> Float[Tensor, "length"]:
-        prior = prior_of(model.codes)
+    def refit(code: Float[Tensor, "length"], progress: Progress) -> tuple[Float[Tensor, "length"], str]:
         start = PlacedCode(0, code, prior.mean[:0], place.to(code.device))
         here = scan.to(code.device)
 
         def report(done: int) -> None:
             progress(done, config.total)
 
-        return fit_scan(model.decoder, here, prior, config, start.place, report, start).code
+        fit = fit_scan(model.decoder, here, prior, config, start.place, report, start)
+        return fit.code, f"{fit.verdict.name}: {fit.verdict.reason}"
 
     return refit
 
@@ -107,10 +115,13 @@ def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device)
         surface.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["surface"])
         sphere = content["unit_sphere"]
         unit = placement_of(sphere["centre"], sphere["radius"])
+    scale = torch.tensor(unit.radius)
+    unit_place = Similarity(torch.eye(3), unit.centre.float(), scale)
     cameras: list[Camera] = []
     if (folder / "transforms.json").is_file():
         cameras = [unit.camera_to_unit(camera) for camera in read_cameras(folder / "transforms.json")]
-    return Scene(f"{folder.name}, a reconstruction", surface.requires_grad_(False).eval(), cameras=cameras)
+    field = surface.requires_grad_(False).eval().to(device)
+    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit_place, device=device)
 
 
 def _placement(path: Path) -> Similarity:

@@ -1,23 +1,25 @@
 """The page: a server on loopback, what it shows, and what it saves."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace import __version__
 from distrace.camera import Camera
-from distrace.files import save_text, written
+from distrace.checkpoints.codes import save_code
+from distrace.files import save_json, save_text, written
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.optional import require
-from distrace.prior import prior_of
 from distrace.shading import save_png
-from distrace.viewer.live import LiveView, Shown, camera_of
+from distrace.viewer.image import Light
+from distrace.viewer.live import TRACING, LiveView, Shown, TracedField, camera_of
 from distrace.viewer.scene import Scene
 
 if TYPE_CHECKING:
@@ -31,6 +33,7 @@ MESH_CELLS = 96  # along each side, of the mesh on the page …
 SAVED_CELLS = 256  # … and of the one that is saved
 SAVED_ROWS = 512  # of the saved picture
 BLUE = (44, 104, 190)
+POINT_SIZE = 0.012  # radii, of an observed point
 ORANGE = (226, 112, 32)
 CLAY = (203, 192, 180)
 
@@ -59,13 +62,13 @@ class Viewer:
         from distrace.viewer.controls import Controls
 
         self.out = Path(out)
-        self.shown = Shown(scene)
-        self.prior = None if scene.model is None else prior_of(scene.model.codes)
+        self.shown = Shown(TracedField(scene))
         self.views: dict[int, LiveView] = {}
         self.changing = Lock()
+        self.closed = False
         with quiet():
             self.server = viser.ViserServer(host=HOST, port=port, label="distrace", verbose=False)
-        self._set_stage(scene)
+        self._add_observation(scene)
         self.controls = Controls(self)
         self.server.on_client_connect(self._connected)
         self.server.on_client_disconnect(self._disconnected)
@@ -75,73 +78,87 @@ class Viewer:
         """Where the page is."""
         return f"http://{HOST}:{self.server.get_port()}"
 
+    @property
+    def scene(self) -> Scene:
+        """What is shown."""
+        return self.shown.field.scene
+
     def close(self) -> None:
-        """Stops the server and all threads."""
+        """Stops the server and all threads; a fit ends at its next iteration."""
+        self.closed = True
+        self.controls.close()
         for view in list(self.views.values()):
             view.close()
         with quiet():
             self.server.stop()
 
-    def show(self, **changes: Any) -> None:
-        """Shows another scene, layer or light in all browsers."""
-        with self.changing:
-            self.shown = replace(self.shown, **changes)
-        for view in list(self.views.values()):
-            view.changed.set()
+    def set_layer(self, layer: str) -> None:
+        """Shows another layer in all browsers."""
+        self._show(lambda shown: replace(shown, layer=layer))
 
-    def show_code(self, code: Float[Tensor, "length"], title: str) -> None:
+    def set_light(self, light: Light) -> None:
+        """Shows the shape in the light from a direction; None: over the camera's shoulder."""
+        self._show(lambda shown: replace(shown, light=light))
+
+    def set_code(self, code: Float[Tensor, "length"], title: str) -> None:
         """Shows another shape of the model."""
-        scene = self.shown.scene
+        scene = self.scene
         assert scene.model is not None
-        self.show(scene=replace(scene, title=title, code=code, sdf=scene.model.field(code)), occupancy=[])
-
-    def mesh(self, cells: int) -> "trimesh.Trimesh":
-        """Returns the mesh of what is shown. Raises `ValueError` where it has no surface."""
-        scene = self.shown.scene
-        return extract_mesh(scene.sdf, MeshConfig(cells, radius=scene.radius, device=scene.device))
+        moved = replace(scene, title=title, code=code, sdf=scene.model.field(code))
+        self._show(lambda shown: replace(shown, field=TracedField(moved)))
 
     def set_mesh(self, visible: bool) -> None:
         """Adds the mesh of what is shown to the page, or takes it away."""
         if not visible:
             self.server.scene.remove_by_name("/mesh")
             return
-        mesh = self.mesh(MESH_CELLS)
+        mesh = _mesh(self.scene, MESH_CELLS)
         self.server.scene.add_mesh_simple("/mesh", np.asarray(mesh.vertices), np.asarray(mesh.faces), color=CLAY)
 
-    def save(self, handle: "CameraHandle | None") -> list[str]:
-        """Writes the mesh, the code, and the picture of a browser's camera; returns the names of the files."""
+    def save(self, handle: "CameraHandle | None") -> Path:
+        """Writes the mesh, the code, its placement, and the picture of a browser's camera into a new folder.
+
+        The mesh is in the frame of the input, and the folder can be opened again.
+        """
         shown = self.shown
-        names = ["mesh.ply"]
-        with written(self.out / "mesh.ply") as file:
-            self.mesh(SAVED_CELLS).export(file, file_type="ply")
-        if shown.scene.code is not None:
-            names.append("code.npy")
-            with written(self.out / "code.npy") as file:
-                np.save(file, shown.scene.code.cpu().numpy())
+        scene = shown.field.scene
+        folder = _fresh(self.out)
+        mesh = _mesh(scene, SAVED_CELLS)
+        mesh.apply_transform(scene.place.T_world_object.double().numpy())
+        with written(folder / "mesh.ply") as file:
+            mesh.export(file, file_type="ply")
+        if scene.code is not None:
+            save_code(folder, scene.code, scene.place)
         if handle is not None:
-            names.append("picture.png")
-            picture, _ = shown.picture(shown.image(camera_of(handle, SAVED_ROWS)))
-            save_png(self.out / "picture.png", picture)
-        return names
+            picture, _ = shown.picture(shown.field.image(camera_of(handle, SAVED_ROWS)))
+            save_png(folder / "picture.png", picture)
+        save_json(folder / "result.json", {"version": __version__, "model": scene.source, "title": scene.title})
+        return folder
 
     def save_page(self, path: str | Path) -> None:
         """Writes a page that needs no server: the mesh, the observed points and the cameras."""
         self.set_mesh(True)
         save_text(path, self.server.scene.as_html())
 
-    def _set_stage(self, scene: Scene) -> None:
+    def _show(self, change: Callable[[Shown], Shown]) -> None:
+        with self.changing:
+            self.shown = change(self.shown)
+        for view in list(self.views.values()):
+            view.changed.set()
+
+    def _add_observation(self, scene: Scene) -> None:
         """Places the first camera, and what the shape was fitted to."""
         stage = self.server.scene
         stage.set_up_direction("+y")
         stage.configure_environment_map(None)
         self.server.gui.configure_theme(show_logo=False, show_share_button=False)  # sharing would leave the machine
         start = self.server.initial_camera
-        start.position = tuple(scene.radius * np.array(EYE))
+        start.position = EYE
         start.look_at = (0.0, 0.0, 0.0)
         start.fov = FIELD_OF_VIEW
         if scene.points is not None:
             points = scene.points.cpu().numpy()
-            stage.add_point_cloud("/points", points, ORANGE, point_size=0.012 * scene.radius, point_shape="circle")
+            stage.add_point_cloud("/points", points, ORANGE, point_size=POINT_SIZE, point_shape="circle")
         if scene.cameras:
             stage.add_frame("/cameras", show_axes=False)
         for number, camera in enumerate(scene.cameras):
@@ -166,9 +183,31 @@ class Viewer:
         if aspect < 1:  # a phone: from so far that the whole shape is seen
             client.camera.position = np.array(self.server.initial_camera.position) / aspect
             client.camera.look_at = np.zeros(3)
-        self.views[client.client_id] = LiveView(client, lambda: self.shown, self.controls.report)
+        view = LiveView(client, lambda: self.shown, self.controls.report)
+        self.views[client.client_id] = view
+        if client.client_id not in self.server.get_clients():  # it left meanwhile
+            self._disconnected(client)
 
     def _disconnected(self, client: "ClientHandle") -> None:
         view = self.views.pop(client.client_id, None)
         if view is not None:
             view.close()
+
+
+def _mesh(scene: Scene, cells: int) -> "trimesh.Trimesh":
+    """Returns a shape's mesh in the unit sphere. Raises `ValueError` where it has no surface."""
+    with TRACING:
+        return extract_mesh(scene.sdf, MeshConfig(cells, device=scene.device))
+
+
+def _fresh(folder: Path) -> Path:
+    """Makes the first of `saved-1`, `saved-2` … that does not exist."""
+    number = 1
+    while True:
+        path = folder / f"saved-{number}"
+        try:
+            path.mkdir(parents=True)
+        except FileExistsError:
+            number += 1
+        else:
+            return path
