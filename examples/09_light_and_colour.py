@@ -11,7 +11,7 @@ from torch.nn.functional import normalize
 import distrace as dt
 from distrace import shading
 
-camera = dt.Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=256, width=256)
+camera = dt.Camera.orbit(30, 20, 4.97, focal_mm=60, sensor_mm=32, height=128, width=128)
 
 
 # %% An image: Lambert's law, any function of points, normals and ray directions
@@ -28,9 +28,9 @@ photograph = image(torch.tensor(0.6), torch.tensor([1.0, 1.0, 0.2]), torch.tenso
 size = torch.tensor(0.5, requires_grad=True)
 light = torch.tensor([-0.5, 1.0, 1.0], requires_grad=True)
 colour = torch.tensor([0.5, 0.5, 0.5], requires_grad=True)
-adam = torch.optim.Adam([size, light, colour], lr=0.04)
+adam = torch.optim.Adam([size, light, colour], lr=0.05)
 pictures = []
-for _ in range(40):
+for _ in range(30):
     adam.zero_grad()
     rendered = image(size, light, colour)
     (rendered - photograph).square().mean().backward()

@@ -18,7 +18,7 @@ model = dt.load_model("sofas")
 model
 
 # %% The code that explains it
-config = dt.CodeFitConfig(starts=4, finalists=1)
+config = dt.CodeFitConfig(starts=2, finalists=1)
 fit = dt.fit_code(model.decoder, [view], dt.prior_of(model.codes), config, lambda done: print(".", end=""))
 fit
 

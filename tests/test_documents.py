@@ -12,6 +12,7 @@ from distrace.checkpoints.model import load_model, save_experiment
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+SLOW = ("08", "10")
 DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "results/README.md", "experiments/README.md")),
@@ -19,11 +20,11 @@ DOCUMENTS = [
 
 
 def run_small(code: str, arguments: tuple[object, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs code that renders 256 × 256 pixels at 48 × 48."""
+    """Runs code at 48 × 48 pixels."""
     monkeypatch.setattr(sys, "argv", ["example", *map(str, arguments)])
     dtype = torch.get_default_dtype()
     try:
-        exec(compile(code.replace("height=256, width=256", "height=48, width=48"), "example", "exec"), {})
+        exec(compile(re.sub(r"height=\d+, width=\d+", "height=48, width=48", code), "example", "exec"), {})
     finally:
         torch.set_default_dtype(dtype)
 
@@ -51,7 +52,11 @@ def arguments(tmp_path: Path) -> dict[str, tuple[object, ...]]:
     }
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] * (path.name[:2] in SLOW)) for path in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_an_example_runs(
     path: Path, tmp_path: Path, arguments: dict[str, tuple[object, ...]], monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
