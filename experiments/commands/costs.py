@@ -139,7 +139,7 @@ class BoundaryGradients:
 
     def run(self) -> None:
         run = start(self.out)
-        view = Camera.orbit(30, 20, 4.97, focal_mm=130, height=self.size, width=self.size, dtype=torch.float64)
+        view = Camera.orbit(30, 20, 4.97, focal_mm=85, height=self.size, width=self.size, dtype=torch.float64)
         rows = []
         with progress("boundary gradients", boundary_gradients.COUNT) as bar:
             for row in boundary_gradients.boundary_rows(view):

@@ -25,7 +25,7 @@ from distrace.tracing.sphere_tracing import TraceConfig
 from experiments.clips.mitsuba_scene import mitsuba, sensor
 
 PARAMETERS = ("position x", "position y", "size")
-START = (0.1, -0.05, 0.4)  # x, y, and the radius or half the edge
+START = (0.1, -0.05, 0.35)  # x, y, and the radius or half the edge: all of it is in the image
 STEP = 0.05  # of central differences: pixels at outlines are black or white, so many must change
 FINER = 8  # of each pixel, in the differences' images: pixel centres alone would move by jumps
 SAMPLES = 128  # of each of Mitsuba's pixels, and as many of outlines
