@@ -29,7 +29,7 @@ def minimise(name, parameters, rate, rendered):
 code = model.codes[1].clone().requires_grad_()
 minimise("code", [code], 0.01, lambda: dt.render(model.field(code), camera))
 
-# %% A camera that is off by 3° and 4°
+# %% A camera that is off by 4° and 3°
 angles = torch.tensor([34.0, 23.0], requires_grad=True)  # azimuth, elevation
 size = {"height": camera.height, "width": camera.width}
 minimise("camera", [angles], 0.8, lambda: dt.render(model.field(0), dt.Camera.orbit(*angles, 4.97, **size)))

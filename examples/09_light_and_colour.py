@@ -36,6 +36,5 @@ for _ in range(30):
     (rendered - photograph).square().mean().backward()
     adam.step()
     pictures.append(shading.colour_picture(rendered))
-found = torch.cat([size[None], normalize(light, dim=0), colour]).tolist()
-print("found", [round(value, 2) for value in found], "of 0.6, (0.7, 0.7, 0.14), (0.8, 0.3, 0.2)")
+print("found", [round(value, 2) for value in torch.cat([size[None], normalize(light, dim=0), colour]).tolist()])
 shading.save_png("out/light.png", shading.side_by_side([pictures[0], pictures[-1], shading.colour_picture(photograph)]))
