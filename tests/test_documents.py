@@ -17,6 +17,11 @@ DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "results/README.md", "experiments/README.md")),
 ]
+TUTORIALS = [
+    *sorted((ROOT / "docs" / "tutorials").glob("*.md")),
+    *(ROOT / "docs" / name for name in ("index.md", "install.md")),
+]
+CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
 def run_small(code: str, arguments: tuple[object, ...], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,9 +78,18 @@ def test_an_example_runs(
 
 
 def test_the_readmes_code_runs(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (code,) = CODE.findall((ROOT / "README.md").read_text(encoding="utf-8"))
     run_small(code, (), monkeypatch)
     assert re.fullmatch(r"\d+ pixels, \d+ evaluations, \|dL/dcode\| \d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("document", "code"),
+    [(path.stem, code) for path in TUTORIALS for code in CODE.findall(path.read_text(encoding="utf-8"))],
+)
+def test_the_code_of_a_tutorial_runs(document: str, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_small(code, (), monkeypatch)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
