@@ -111,4 +111,5 @@ def test_links_and_paths_of_documents_exist(document: Path) -> None:
 
 def heading_anchor(line: str) -> str:
     """The anchor that GitHub gives to a heading."""
-    return re.sub(r"[^\w -]", "", line.lstrip("#").strip().lower()).replace(" ", "-")
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)  # of a link its words
+    return re.sub(r"[^\w -]", "", text.lstrip("#").strip().lower()).replace(" ", "-")
