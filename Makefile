@@ -1,7 +1,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test test-slow check results release lock clean
+.PHONY: demo test test-slow check docs results release lock clean
 
 demo: .venv/installed
 	$(BIN)/distrace demo --out out/demo
@@ -16,6 +16,9 @@ check: .venv/installed  ## style and types
 	$(BIN)/ruff check src experiments tests examples
 	$(BIN)/ruff format --check src experiments tests examples
 	$(BIN)/pyright
+
+docs: .venv/installed  ## the documentation, which opens as out/docs/index.html
+	NO_MKDOCS_2_WARNING=1 PATH="$(CURDIR)/$(BIN):$$PATH" $(BIN)/python -m mkdocs build --strict
 
 results: .venv/installed  ## the tables that take under a minute
 	$(BIN)/python -m experiments fields sofas --size 64 --out out/fields

@@ -2,7 +2,7 @@
 
 from distrace.cli import run_commands
 from experiments.commands.clip import Clip
-from experiments.commands.costs import Fields, Gradients, Growth, Memory, Solvers
+from experiments.commands.costs import BoundaryGradients, Fields, Gradients, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
 from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
@@ -17,6 +17,7 @@ COMMANDS = {
     "views": Views,
     "fields": Fields,
     "gradients": Gradients,
+    "boundary-gradients": BoundaryGradients,
     "growth": Growth,
     "memory": Memory,
     "solvers": Solvers,

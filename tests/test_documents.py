@@ -12,18 +12,24 @@ from distrace.checkpoints.model import load_model, save_experiment
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
+SLOW = ("08", "10")
 DOCUMENTS = [
-    *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "results/README.md", "experiments/README.md")),
 ]
+TUTORIALS = [
+    *sorted((ROOT / "docs" / "tutorials").glob("*.md")),
+    *(ROOT / "docs" / name for name in ("index.md", "install.md")),
+]
+CODE = re.compile(r"```python\n(.*?)```", re.DOTALL)
 
 
 def run_small(code: str, arguments: tuple[object, ...], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs code that renders 256 × 256 pixels at 48 × 48."""
+    """Runs code at 48 × 48 pixels."""
     monkeypatch.setattr(sys, "argv", ["example", *map(str, arguments)])
     dtype = torch.get_default_dtype()
     try:
-        exec(compile(code.replace("height=256, width=256", "height=48, width=48"), "example", "exec"), {})
+        exec(compile(re.sub(r"height=\d+, width=\d+", "height=48, width=48", code), "example", "exec"), {})
     finally:
         torch.set_default_dtype(dtype)
 
@@ -44,7 +50,6 @@ def arguments(tmp_path: Path) -> dict[str, tuple[object, ...]]:
     (tmp_path / "models" / "wrong").mkdir()
     (tmp_path / "models" / "wrong" / "specs.json").write_text("{}")
     return {
-        "01": (tmp_path / "out.png",),
         "02": ("sofas", tmp_path / "out.png"),
         "03": (tmp_path / "balls.csv", "ball", tmp_path, tmp_path / "out"),
         "04": (tmp_path / "models", tmp_path / "out.png"),
@@ -52,11 +57,18 @@ def arguments(tmp_path: Path) -> dict[str, tuple[object, ...]]:
     }
 
 
-@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, marks=[pytest.mark.slow] * (path.name[:2] in SLOW)) for path in EXAMPLES],
+    ids=lambda path: path.stem,
+)
 def test_an_example_runs(
-    path: Path, arguments: dict[str, tuple[object, ...]], monkeypatch: pytest.MonkeyPatch, capsys
+    path: Path, tmp_path: Path, arguments: dict[str, tuple[object, ...]], monkeypatch: pytest.MonkeyPatch, capsys
 ) -> None:
+    if "browser" in path.stem:
+        pytest.importorskip("viser")
     given = arguments.get(path.name[:2], ())
+    monkeypatch.chdir(tmp_path)
     run_small(path.read_text(encoding="utf-8"), given, monkeypatch)
     printed = capsys.readouterr().out
     assert printed or Path(str(given[-1])).exists()
@@ -66,9 +78,18 @@ def test_an_example_runs(
 
 
 def test_the_readmes_code_runs(monkeypatch: pytest.MonkeyPatch, capsys) -> None:
-    (code,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (code,) = CODE.findall((ROOT / "README.md").read_text(encoding="utf-8"))
     run_small(code, (), monkeypatch)
     assert re.fullmatch(r"\d+ pixels, \d+ evaluations, \|dL/dcode\| \d+\.\d+\n", capsys.readouterr().out)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("document", "code"),
+    [(path.stem, code) for path in TUTORIALS for code in CODE.findall(path.read_text(encoding="utf-8"))],
+)
+def test_the_code_of_a_tutorial_runs(document: str, code: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    run_small(code, (), monkeypatch)
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.relative_to(ROOT).as_posix())
@@ -90,4 +111,5 @@ def test_links_and_paths_of_documents_exist(document: Path) -> None:
 
 def heading_anchor(line: str) -> str:
     """The anchor that GitHub gives to a heading."""
-    return re.sub(r"[^\w -]", "", line.lstrip("#").strip().lower()).replace(" ", "-")
+    text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", line)  # of a link its words
+    return re.sub(r"[^\w -]", "", text.lstrip("#").strip().lower()).replace(" ", "-")

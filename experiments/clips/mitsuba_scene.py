@@ -21,15 +21,15 @@ BOUNCES = 3
 AXES = np.diag([-1.0, -1.0, 1.0, 1.0])  # Mitsuba's cameras have x to the left and y up
 
 
-def mitsuba() -> Any:
-    """Imports Mitsuba, in the variant that needs no compiler. Raises `ValueError` where it is not installed."""
+def mitsuba(variant: str = "scalar_rgb") -> Any:
+    """Imports Mitsuba, by default in the variant that needs no compiler. Raises `ValueError` where it is missing."""
     try:
         library = importlib.import_module("mitsuba")
     except ImportError as error:
         raise ValueError(
-            "clips are rendered by Mitsuba, which is not installed; `pip install 'distrace[clips]'` installs it"
+            "this command renders by Mitsuba, which is not installed; `pip install 'distrace[clips]'` installs it"
         ) from error
-    library.set_variant("scalar_rgb")
+    library.set_variant(variant)
     return library
 
 
@@ -53,7 +53,7 @@ def photograph(stage: Stage, camera: Camera, samples: int, seed: int) -> Picture
     """Renders an image in 8-bit sRGB."""
     mi = mitsuba()
     sampler = {"type": "independent", "sample_count": samples}
-    scene = mi.load_dict({**stage.lit, "sensor": _sensor(mi, camera, sampler)})
+    scene = mi.load_dict({**stage.lit, "sensor": sensor(mi, camera, sampler)})
     path = mi.load_dict({"type": "path", "max_depth": BOUNCES})
     bitmap = mi.Bitmap(mi.render(scene, integrator=path, seed=seed % 2**32))
     return np.array(bitmap.convert(mi.Bitmap.PixelFormat.RGB, mi.Struct.Type.UInt8, srgb_gamma=True))
@@ -63,7 +63,7 @@ def truth(stage: Stage, camera: Camera) -> tuple[Bool[np.ndarray, "height width"
     """Renders the mask of the shape at the pixels' centres, and its depth z, `inf` on the background."""
     mi = mitsuba()
     sampler = {"type": "stratified", "sample_count": 1, "jitter": False}
-    scene = mi.load_dict({**stage.alone, "sensor": _sensor(mi, camera, sampler)})
+    scene = mi.load_dict({**stage.alone, "sensor": sensor(mi, camera, sampler)})
     aovs = mi.load_dict({"type": "aov", "aovs": "distance:depth,point:position"})
     channels = np.array(mi.render(scene, integrator=aovs), np.float64)
     mask = channels[..., -4] > 0
@@ -72,7 +72,7 @@ def truth(stage: Stage, camera: Camera) -> tuple[Bool[np.ndarray, "height width"
     return mask, np.where(mask, (points - pose[:3, 3]) @ pose[:3, 2], np.inf).astype(np.float32)
 
 
-def _sensor(mi: Any, camera: Camera, sampler: dict[str, Any]) -> dict[str, Any]:
+def sensor(mi: Any, camera: Camera, sampler: dict[str, Any]) -> dict[str, Any]:
     """Returns Mitsuba's camera; the principal point is the middle of the image."""
     focal = camera.intrinsics[0, 0].item()
     return {

@@ -1,17 +1,18 @@
 """Costs and errors of tracing, and the speed of solvers."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import torch
 import tyro
 
 from distrace.benchmarks.measuring import poster_view
+from distrace.camera import Camera
 from distrace.cli.bench import finish, rows_of, show
 from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.files import save_json, save_text
-from experiments.costs import backward, fields, gradients, growth, pages, solvers
+from experiments.costs import backward, boundary_gradients, fields, gradients, growth, pages, solvers
 from experiments.datasets.splits import on_side
 
 Name = tyro.conf.Positional[ModelName]
@@ -123,6 +124,28 @@ class Gradients:
         show(timing)
         evaluations = sum(subject.sdf.evaluations for subject in subjects)
         run.finish({"rows": facts, "timing": timing, **origin(), "evaluations": evaluations})
+
+
+@dataclass(frozen=True)
+class BoundaryGradients:
+    """Compare gradients of outlines with Mitsuba's, each against differences of the renderer's own images.
+
+    Needs the extra `clips`, and LLVM 19 for Mitsuba; DRJIT_LIBLLVM_PATH names its library.
+    """
+
+    out: Path = Path("out/boundary-gradients")
+    size: int = 64  # pixels along each side
+
+    def run(self) -> None:
+        run = start(self.out)
+        view = Camera.orbit(30, 20, 4.97, focal_mm=85, height=self.size, width=self.size, dtype=torch.float64)
+        rows = []
+        with progress("boundary gradients", boundary_gradients.COUNT) as bar:
+            for row in boundary_gradients.boundary_rows(view):
+                rows.append(asdict(row))
+                bar.advance(f"{row.field} by {row.parameter}, {row.method}")
+        show_table(rows)
+        run.finish({"rows": rows, **origin()})
 
 
 @dataclass(frozen=True)

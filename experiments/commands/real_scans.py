@@ -7,8 +7,9 @@ from pathlib import Path
 
 import tyro
 
+from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
-from distrace.cli.common import save_code, save_completed, show_table
+from distrace.cli.common import save_completed, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.data.scan_files import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan

@@ -37,6 +37,7 @@ DEGREES = 5.0
 PERCENT = 5.0
 SYMMETRY_STEP = 10  # degrees between the turns that are compared
 SYMMETRIC = 0.6  # Chamfer × 1000 up to which a turned shape is the same
+MEASURE = 2  # counts the definitions of the errors; files of earlier ones are computed again
 USUAL_FACTOR = 2.0  # × the class's median Chamfer: up to there a completion is good
 
 
@@ -102,7 +103,7 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     path = place.out / "trials" / trial.file
     model = place.model_of(trial.category)
     config = ScanFitConfig()
-    mark = fingerprint(model, place.resolution, config)
+    mark = fingerprint(model, place.resolution, config, MEASURE)
     if path.is_file():
         content = read_json(path)
         if content.pop("made_by", None) == mark:

@@ -24,7 +24,6 @@ from distrace.tracing.tracer import TracerConfig, trace_images
 
 FOOTPRINT = 10.0  # pixels: with narrower ones the derivatives of a ReLU network's normals are off by more than 10 %
 WIDEST = 1 / 24  # of the radius: what coarse pixels cover is no longer one piece of surface
-
 CLEARANCE_REACH = 0.02  # of the radius: the first step of the search for a ray's least value
 DOUBTFUL_SHARE = 1e-3  # of the rays: more without an answer are worth a warning
 
@@ -52,6 +51,11 @@ class Buffers(ByValue):
     def __repr__(self) -> str:
         hits = f"{int(self.mask.sum()):,} of {self.mask.numel():,} rays hit"
         return f"Buffers({summary(self.trace.distance)}, {hits}, radius={self.radius:g})"
+
+    def _repr_png_(self) -> bytes | None:
+        from distrace import notebook
+
+        return notebook.strip_png(self.rays, self.trace.distance, self.cosines, self.field_at)
 
     @property
     def mask(self) -> Bool[Tensor, "*batch"]:
@@ -85,8 +89,7 @@ class Buffers(ByValue):
     @cached
     def points(self) -> Float[Tensor, "hits 3"]:
         """The points that the rays of the mask hit, in the world."""
-        hit = self.trace.hit
-        return self.rays[hit].at(self.distance[hit])
+        return self.rays[self.mask].at(self.distance[self.mask])
 
     @property
     @cached
@@ -131,8 +134,7 @@ class Buffers(ByValue):
         width = 2 * pixels + 1
         grown = max_pool2d(inner, width, 1, pixels)[..., 0, :, :] > 0
         shrunk = -max_pool2d(-inner, width, 1, pixels)[..., 0, :, :] > 0
-        met = torch.isfinite(self.trace.closest)
-        return self._least(grown & ~self.mask & met, self.mask & ~shrunk)
+        return self._least(grown & ~self.mask & torch.isfinite(self.trace.closest), self.mask & ~shrunk)
 
     def _least(self, missed: Bool[Tensor, "*batch"], hit: Bool[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
         closest = self.trace.closest
@@ -217,8 +219,6 @@ def _warn(trace: Trace) -> None:
     """Warns of a picture that may be wrong."""
     exhausted = int((trace.outcome == Outcome.EXHAUSTED).sum())
     inside = int((trace.outcome == Outcome.INSIDE).sum())
-    if not exhausted and not inside:
-        return
     met = int(torch.isfinite(trace.closest).sum())
     if exhausted > DOUBTFUL_SHARE * met:
         warnings.warn(

@@ -66,6 +66,13 @@ class Model(ByValue):
         codes = summary(self.codes)
         return f"Model({self.name!r}, {len(self.shapes)} shapes, codes={codes}, {self.decoder.specs.size})"
 
+    def _repr_html_(self) -> str:
+        """Returns what Jupyter shows."""
+        from distrace import notebook
+
+        facts = {"network": self.decoder.specs.size, "shapes": len(self.shapes), "named": self.shapes}
+        return notebook.table(self.name, facts)
+
     def code_of(self, shape: str) -> Float[Tensor, "length"]:
         """Returns the code of a training shape. Raises `ValueError` for a name that the model has not."""
         if shape not in self.shapes:

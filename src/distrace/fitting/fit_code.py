@@ -90,6 +90,13 @@ class CodeFit:
     evaluations: int  # of the field
     seconds: float
 
+    def _repr_html_(self) -> str:
+        """Returns what Jupyter shows."""
+        from distrace import notebook
+
+        facts = {"loss": self.loss, "evaluations": self.evaluations, "seconds": self.seconds}
+        return notebook.table("CodeFit", facts)
+
 
 @dataclass(frozen=True)
 class Observed:

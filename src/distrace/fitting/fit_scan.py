@@ -54,6 +54,14 @@ class ScanFit:
     seconds: float
     others: tuple[tuple[Tensor, Similarity], ...]  # ends that are nearly as good
 
+    def _repr_html_(self) -> str:
+        """Returns what Jupyter shows."""
+        from distrace import notebook
+
+        verdict = f"{self.verdict.name}: {self.verdict.reason}"
+        facts = {"loss": self.loss, "evaluations": self.evaluations, "seconds": self.seconds}
+        return notebook.table("ScanFit", {**facts, "verdict": verdict})
+
 
 def fit_scan(
     decoder: Decoder,
