@@ -22,6 +22,7 @@ import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import COMMANDS, parsed, show
+from distrace.cli.common import save_mesh
 from distrace.cli.console import progress
 from distrace.data.observation import View, load_view, read_view, save_view
 from distrace.data.samples import write_samples
@@ -78,7 +79,16 @@ def result(out: Path, *keys: str) -> dict:
     return content
 
 
-COMPLETED = {"result.json", "mesh.ply", "mesh.glb", "placement.json", "code.npy", "report.html", "shaded.png"}
+COMPLETED = {
+    "result.json",
+    "scan.npz",
+    "mesh.ply",
+    "mesh.glb",
+    "placement.json",
+    "code.npy",
+    "report.html",
+    "shaded.png",
+}
 
 
 def names(folder: Path) -> set[str]:
@@ -210,6 +220,28 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
         assert facts["evaluations"] > 1000
 
 
+def test_mesh_writes_each_format_that_was_given_and_no_other(model: Path, run: Command, tmp_path: Path) -> None:
+    run("mesh", model, "--resolution", 16, "--format", "glb", "obj", "--out", tmp_path)
+    assert names(tmp_path) == {"result.json", "mesh.glb", "mesh.obj"}
+    faces = result(tmp_path)["faces"]
+    for name in ("mesh.glb", "mesh.obj"):
+        mesh = trimesh.load(tmp_path / name, process=False, force="mesh")
+        assert len(mesh.faces) == faces
+        assert np.linalg.norm(mesh.vertices, axis=1).mean() == pytest.approx(RADII[0], abs=0.04)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_a_mesh_is_one_file_that_keeps_the_colours_of_its_vertices(kind: str, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.visual.vertex_colors = np.rint(127.5 * (ball.vertices + 1)).astype(np.uint8)
+    save_mesh(tmp_path / f"mesh.{kind}", ball)
+    assert names(tmp_path) == {f"mesh.{kind}"}
+    read = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
+    assert read.vertices == pytest.approx(ball.vertices, abs=1e-6)
+    assert (read.faces == ball.faces).all()
+    assert (read.visual.vertex_colors[:, :3] == ball.visual.vertex_colors[:, :3]).all()
+
+
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     trimesh.creation.icosphere(subdivisions=3, radius=0.6).export(tmp_path / "true.ply")
     options = ("--points", 50, "--solver", "adam", "--iterations", 15, "--starts", 2, "--resolution", 16)
@@ -235,17 +267,17 @@ def test_complete_finds_where_the_shape_is(model: Path, run: Command, tmp_path: 
     ball.update_faces(ball.triangles_center[:, 2] > 8.5)
     ball.remove_unreferenced_vertices()
     ball.export(tmp_path / "part.ply")
-    options = ("--reference", tmp_path / "true.ply", "--resolution", 24, "--up", "z", "--strict")
+    options = ("--reference", tmp_path / "true.ply", "--resolution", 24, "--up", "z", "--strict", "--format", "obj")
     run("complete", model, tmp_path / "part.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
-    assert names(out) == COMPLETED
+    assert names(out) == COMPLETED | {"mesh.obj"}
     facts = result(
         out, "evaluations", "verdict", "explained", "free_space_violated", "disagreement", "reason", "chamfer"
     )
     assert facts["verdict"] == "trusted"
     matrix = np.array(json.loads((out / "placement.json").read_text())["T_input_object"])
     assert np.abs(matrix[:3, 3] - (5.0, -3.0, 9.0)).max() < 0.15
-    for name in ("mesh.ply", "mesh.glb"):
+    for name in ("mesh.ply", "mesh.glb", "mesh.obj"):
         vertices = trimesh.load(out / name, process=False, force="mesh").vertices
         assert np.linalg.norm(vertices - (5.0, -3.0, 9.0), axis=1).mean() == pytest.approx(1.2, abs=0.06)
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -492,6 +524,9 @@ BAD = [
     ("mesh {model} --resolution 3", "resolution of 3"),
     ("mesh {model} --resolution 20", "resolution of 20"),
     ("mesh {model} --code 9", "code 9"),
+    ("mesh {model} --format stl", "Invalid choice 'stl'"),
+    ("mesh {model} --format", "--format was given without a format"),
+    ("complete {model} {view} --format stl", "Invalid choice 'stl'"),
     ("bench trace {model} --size 0", "0 × 0"),
     ("bench everything {model}", "trace"),
     ("bench trace", "bench trace was given no model"),

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 import torch
@@ -40,6 +40,7 @@ CodeName = Annotated[
     str, tyro.conf.arg(metavar="CODE", help="a training shape's number or name, or a code.npy that a command wrote")
 ]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Format = Literal["ply", "glb", "obj"]
 
 
 def default(value: object, metavar: str | None = None) -> Any:
@@ -130,9 +131,23 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
 
 
 def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a mesh in the format of the name: PLY or GLB."""
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices."""
+    kind = path.suffix.removeprefix(".")
+    options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
     with written(path) as file:
-        mesh.export(file, file_type=path.suffix.removeprefix("."))
+        mesh.export(file, file_type=kind, **options)
+
+
+def save_meshes(folder: Path, mesh: "trimesh.Trimesh", formats: Sequence[Format]) -> None:
+    """Writes `mesh.ply`, `mesh.glb` or `mesh.obj`: one file for each format."""
+    for kind in dict.fromkeys(formats):
+        save_mesh(folder / f"mesh.{kind}", mesh)
+
+
+def check_formats(formats: Sequence[Format]) -> None:
+    """Raises `ValueError` where no format was given, so that no mesh would be written."""
+    if not formats:
+        raise ValueError("--format was given without a format; name ply, glb, obj, or several of them")
 
 
 def save_code(folder: Path, code: Tensor, place: Similarity) -> None:
@@ -140,12 +155,6 @@ def save_code(folder: Path, code: Tensor, place: Similarity) -> None:
     with written(folder / "code.npy") as file:
         np.save(file, code.cpu().numpy())
     save_json(folder / "placement.json", {"T_input_object": place.T_world_object.tolist()})
-
-
-def save_completed(folder: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a completed mesh in both formats."""
-    save_mesh(folder / "mesh.ply", mesh)
-    save_mesh(folder / "mesh.glb", mesh)
 
 
 def chamfer_facts(distances: Chamfer) -> tuple[dict[str, float], str]:

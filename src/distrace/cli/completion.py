@@ -12,7 +12,7 @@ from distrace import shading
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_code, save_completed, save_mesh
+from distrace.cli.common import Format, chamfer_facts, save_code, save_mesh, save_meshes
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
@@ -34,6 +34,7 @@ from distrace.report import completion_page as report
 if TYPE_CHECKING:
     import trimesh
 
+COMPLETED: tuple[Format, ...] = ("ply", "glb")  # always written
 CLOUD_SIZE = 256  # pixels along each side of the pictures of a cloud's completion
 SMALL = 144  # pixels along each side of the pictures of other completions
 SPREAD = 0.1  # distance between completions that is drawn in the fullest colour
@@ -50,6 +51,7 @@ class Task:
     fit: FitConfig | CodeFitConfig
     mesh: MeshConfig
     plausible: int = 0  # number of other completions
+    formats: tuple[Format, ...] = COMPLETED
 
     @property
     def camera(self) -> Camera:
@@ -81,7 +83,7 @@ def complete(run: Run, task: Task) -> Verdict:
     save_code(run.out, fit.code, Similarity.identity())
     save_scan(run.out / "scan.npz", canonical_scan(task.known))
     outcome = _outcome(task, fit)
-    save_completed(run.out, outcome.mesh)
+    save_meshes(run.out, outcome.mesh, task.formats)
     for number, code in enumerate(outcome.others, 1):
         save_mesh(run.out / f"plausible-{number}.ply", task.surface(code))
     content = _page_content(task, outcome)

@@ -9,7 +9,7 @@ import torch
 from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_code, save_completed
+from distrace.cli.common import Format, chamfer_facts, save_code, save_meshes
 from distrace.cli.console import Run, console, progress
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import Scan
@@ -46,6 +46,7 @@ class ScanTask:
     truth: "trimesh.Trimesh | np.ndarray | None"  # in the scan's frame
     mesh: MeshConfig
     seed: int
+    formats: tuple[Format, ...]
 
 
 def complete_scan(run: Run, task: ScanTask) -> Verdict:
@@ -56,7 +57,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     save_scan(run.out / "scan.npz", task.scan)
     mesh = extract_mesh(task.model.field(fit.code), task.mesh)
     mesh.apply_transform(place.T_world_object.double().numpy())
-    save_completed(run.out, mesh)
+    save_meshes(run.out, mesh, task.formats)
     pictures = _pictures(task, fit, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
     facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}

@@ -14,12 +14,14 @@ from distrace.checkpoints.codes import named_code
 from distrace.cli.common import (
     CodeName,
     Flag,
+    Format,
     ModelName,
     Orbit,
+    check_formats,
     default,
     opened_for,
     save_buffers,
-    save_mesh,
+    save_meshes,
     save_pictures,
 )
 from distrace.cli.console import progress, start
@@ -152,14 +154,16 @@ class Mesh:
     out: Path = Path("out/mesh")
     code: CodeName = "0"
     resolution: int = 256  # cells along each side of the cube around the unit sphere
+    format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
     device: str = "cpu"
 
     def run(self) -> None:
+        check_formats(self.format)
         run = start(self.out, self.device)
         model = opened_for(run, self.model)
         counted = Counted(model.field(named_code(model, self.code)))
         with run.noticing():
             surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
-        save_mesh(run.out / "mesh.ply", surface)
+        save_meshes(run.out, surface, self.format)
         evaluations = {"evaluations": counted.evaluations, "setup_evaluations": counted.evaluations}
         run.finish({**evaluations, "faces": len(surface.faces)}, f"{len(surface.faces)} faces")
