@@ -10,7 +10,7 @@ ORDER = [
     *("threads", "imports", "optional", "errors", "files", "processes", "equality", "image_cache", "pixels", "vectors"),
     *("rays", "viewpoint", "camera", "pose"),
     *("fields", "checkpoints", "prior"),
-    *("tracing", "surface", "render", "boundary", "shading", "movie", "checking"),
+    *("tracing", "surface", "render", "boundary", "shading", "antialiasing", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photos", "reconstruction", "public"),
     *("report", "benchmarks", "cli", "__main__"),

@@ -19,8 +19,8 @@ from distrace.files import save_arrays, save_json, written
 from distrace.metrics import Chamfer
 from distrace.pose import Similarity
 from distrace.render import Buffers
-from distrace.report.completion_page import View
 from distrace.report.page import short
+from distrace.shading import Picture, Rgba
 
 if TYPE_CHECKING:
     import trimesh
@@ -111,12 +111,12 @@ class Orbit:
         )
 
 
-def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:
+def save_pictures(folder: Path, buffers: Buffers, camera: Camera, shaded: Picture | Rgba, mask: Picture) -> None:
     pictures = {
         "depth": shading.depth_picture(buffers.depth),
         "normal": shading.normal_picture(buffers.normal, buffers.mask, camera.T_world_camera),
-        "mask": shading.mask_picture(buffers.mask),
-        "shaded": View.of(buffers).shaded,
+        "mask": mask,
+        "shaded": shaded,
     }
     for name, image in pictures.items():
         shading.save_png(folder / f"{name}.png", image)
