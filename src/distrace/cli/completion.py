@@ -1,6 +1,6 @@
 """A completion in the canonical frame: the fit, the mesh, the distance to the truth, the verdict, and the page."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -86,7 +86,7 @@ def complete(run: Run, task: Task) -> Verdict:
     save_meshes(run.out, outcome.mesh, task.formats)
     for number, code in enumerate(outcome.others, 1):
         save_mesh(run.out / f"plausible-{number}.ply", task.surface(code))
-    content = _page_content(task, outcome)
+    content = replace(_page_content(task, outcome), origin=run.origin)
     shading.save_png(run.out / "shaded.png", content.after.shaded)
     with run.optional("report.html"):
         save_text(run.out / "report.html", report.completion_page(content))
@@ -123,7 +123,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, code)
         camera = task.camera.to(task.mesh.device)
-        before, after = (report.View.of(render(task.model.field(code), camera)) for code in codes)
+        before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
     facts = {
         "points used": str(len(points)),
@@ -151,7 +151,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         others=_other_pictures(task, outcome) if outcome.others else [],
         losses=outcome.fit.losses,
         mesh=outcome.mesh,
-        truth_points=task.truth if isinstance(task.truth, np.ndarray | None) else task.truth.vertices,
+        truth_surface=task.truth,
         chamfer=outcome.chamfer,
         facts=facts,
         chosen=next(iter(outcome.fit.losses)),
@@ -170,7 +170,7 @@ def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
         distance[buffers.mask] = spread(model, codes, buffers.points)
-        pictures = [report.View.of(render(model.field(code), eye)).shaded for code in codes]
+        pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows
 

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 
 from distrace import shading
+from distrace.antialiasing import smooth_outline
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Format, chamfer_facts, save_code, save_meshes
@@ -21,7 +22,6 @@ from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.render import render
-from distrace.report.completion_page import View
 from distrace.report.scan_page import scan_page
 
 if TYPE_CHECKING:
@@ -76,6 +76,8 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
             losses=fit.losses,
             place=place,
             facts=_facts(task, fit),
+            truth=task.truth,
+            origin=run.origin,
         )
         save_text(run.out / "report.html", content)
     run.finish(facts, *lines)
@@ -101,7 +103,8 @@ def _pictures(task: ScanTask, fit: ScanFit, place: Similarity) -> dict[str, shad
         cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, PICTURE / max(view.depth.shape))))
     for name, (azimuth, elevation) in VIEWS.items():
         cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
-    return {name: View.of(render(sdf, camera.to(task.mesh.device))).shaded for name, camera in cameras.items()}
+    on_device = {name: camera.to(task.mesh.device) for name, camera in cameras.items()}
+    return {name: smooth_outline(render(sdf, camera), camera) for name, camera in on_device.items()}
 
 
 def _in_object(shape: "trimesh.Trimesh | np.ndarray", place: Similarity) -> "trimesh.Trimesh | np.ndarray":
