@@ -60,11 +60,7 @@ def scan_page(
         [
             verdict_banner(verdict),
             section("Shape", row(*inputs, *shapes)),
-            surfaces_section(
-                _turned(mesh, turn),
-                {"Points of the input": points @ turn},
-                truth,
-            ),
+            surfaces_section(_turned(mesh, turn), {"Points of the input": points @ turn}, truth),
             section("Verdict", paragraph(ABOUT_VERDICT), table(("", ""), evidence)),
             section("Placement", paragraph(ABOUT_PLACEMENT), table([""] * 4, matrix)),
             starts_section(losses, next(iter(losses), None)),

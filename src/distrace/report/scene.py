@@ -61,8 +61,8 @@ def scene(
     points = [
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
     ]
-    for trace in (*surfaces, *points):
-        if trace.name in map(escape, hidden):
+    for name, trace in zip((*meshes, *clouds), (*surfaces, *points)):
+        if name in hidden:
             trace.visible = "legendonly"
     no_axis = dict(visible=False)
     everything = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes.values()), *clouds.values()])
