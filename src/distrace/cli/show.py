@@ -74,7 +74,7 @@ class Render(Orbit):
     """fast is distrace's tracer; the others are DIST's strategies"""
     steps: Annotated[int | None, default("the strategy's", "INT")] = None  # maximum for a ray; not for fast
     clearance: Flag = False  # also write the least distance on each ray that misses, at the cost of evaluations
-    samples: int = 1  # along each side of a pixel, averaged in shaded.png, mask.png and the movie: 4 takes 16 × as long
+    samples: int = 1  # rays along each side of a pixel, averaged in shaded.png, mask.png and the movie
     background: Annotated[str, tyro.conf.arg(metavar="white|transparent|R,G,B")] = "white"  # of shaded.png, the movie
     light: Annotated[str | None, default("over the camera's left shoulder", "AZIMUTH,ELEVATION")] = None
     """direction to the light in degrees, as the camera's"""
