@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,6 +23,7 @@ import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import COMMANDS, parsed, show
+from distrace.cli.common import save_mesh
 from distrace.cli.console import progress
 from distrace.data.observation import View, load_view, read_view, save_view
 from distrace.data.samples import write_samples
@@ -78,7 +80,16 @@ def result(out: Path, *keys: str) -> dict:
     return content
 
 
-COMPLETED = {"result.json", "mesh.ply", "mesh.glb", "placement.json", "code.npy", "report.html", "shaded.png"}
+COMPLETED = {
+    "result.json",
+    "scan.npz",
+    "mesh.ply",
+    "mesh.glb",
+    "placement.json",
+    "code.npy",
+    "report.html",
+    "shaded.png",
+}
 
 
 def names(folder: Path) -> set[str]:
@@ -110,6 +121,26 @@ def test_render_writes_arrays_and_pictures(model: Path, run: Command, tmp_path: 
     assert facts["setup_evaluations"] > 0
     assert facts["clearance_evaluations"] == 0
     assert facts["gradient_evaluations"] == facts["outcomes"]["hit"] == arrays["mask"].sum()
+
+
+def test_samples_background_and_light_change_pictures_and_no_arrays(model: Path, run: Command, tmp_path: Path) -> None:
+    run("render", model, "--out", tmp_path / "plain", *VIEW)
+    look = ("--samples", 3, "--background", "transparent", "--light=-60,10")
+    run("render", model, "--out", tmp_path / "fine", *look, *VIEW)
+    plain, fine = (
+        {name: np.asarray(Image.open(tmp_path / kind / f"{name}.png")) for name in ("shaded", "mask", "normal")}
+        for kind in ("plain", "fine")
+    )
+    assert fine["shaded"].shape == (32, 32, 4)
+    assert (plain["normal"] == fine["normal"]).all()
+    assert len(np.unique(plain["mask"])) < len(np.unique(fine["mask"]))
+    left, right = fine["shaded"][16, 10, :3].sum(), fine["shaded"][16, 22, :3].sum()
+    assert left > right + 100
+    with np.load(tmp_path / "plain" / "buffers.npz") as one, np.load(tmp_path / "fine" / "buffers.npz") as other:
+        assert all((one[name] == other[name]).all() for name in one.files)
+    assert result(tmp_path / "fine")["sample_evaluations"] > result(tmp_path / "fine")["evaluations"]
+    run("render", model, "--out", tmp_path / "blue", "--background", "0,0,255", *VIEW)
+    assert np.asarray(Image.open(tmp_path / "blue" / "shaded.png"))[0, 0].tolist() == [0, 0, 255]
 
 
 def test_render_counts_what_the_clearance_costs(model: Path, run: Command, tmp_path: Path) -> None:
@@ -198,6 +229,32 @@ def test_ctrl_c_in_an_orbit_leaves_the_first_view_and_no_half_movie(
     assert names(tmp_path) == {"buffers.npz", "view.npz", "depth.png", "normal.png", "mask.png", "shaded.png"}
 
 
+def test_shapes_lists_numbers_and_names(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run("shapes", model, "--out", tmp_path)
+    assert names(tmp_path) == {"result.json"}
+    shapes = load_model(model).shapes
+    assert result(tmp_path, "shapes")["shapes"] == list(shapes)
+    said = capsys.readouterr().out
+    assert all(f"{number} {name}" in said for number, name in enumerate(shapes))
+
+
+@pytest.mark.parametrize(("given", "columns"), [("1", 1), ("all", 2), ("9", 2)])
+def test_shapes_draws_the_first_shapes_in_one_sheet(
+    given: str, columns: int, model: Path, run: Command, tmp_path: Path
+) -> None:
+    run("shapes", model, "--thumbnails", given, "--out", tmp_path)
+    sheet = np.asarray(Image.open(tmp_path / "shapes.png"))
+    assert sheet.shape == (96 + 30, columns * (96 + 8) - 8, 3)
+    for left in range(0, sheet.shape[1], 104):
+        assert (sheet[:96, left : left + 96] < 200).any(), "a shape"
+        assert (sheet[96:, left : left + 96] < 120).any(), "its name"
+    facts = result(tmp_path, "shapes", "evaluations")
+    assert facts["thumbnails"] == columns
+    assert facts["evaluations"] > 1000
+
+
 def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
     for code, radius in enumerate(RADII):
         out = tmp_path / str(code)
@@ -208,6 +265,28 @@ def test_mesh_writes_a_mesh(model: Path, run: Command, tmp_path: Path) -> None:
         facts = result(out, "evaluations", "setup_evaluations")
         assert facts["faces"] == len(mesh.faces)
         assert facts["evaluations"] > 1000
+
+
+def test_mesh_writes_each_format_that_was_given_and_no_other(model: Path, run: Command, tmp_path: Path) -> None:
+    run("mesh", model, "--resolution", 16, "--format", "glb", "obj", "--out", tmp_path)
+    assert names(tmp_path) == {"result.json", "mesh.glb", "mesh.obj"}
+    faces = result(tmp_path)["faces"]
+    for name in ("mesh.glb", "mesh.obj"):
+        mesh = trimesh.load(tmp_path / name, process=False, force="mesh")
+        assert len(mesh.faces) == faces
+        assert np.linalg.norm(mesh.vertices, axis=1).mean() == pytest.approx(RADII[0], abs=0.04)
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_a_mesh_is_one_file_that_keeps_the_colours_of_its_vertices(kind: str, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.visual.vertex_colors = np.rint(127.5 * (ball.vertices + 1)).astype(np.uint8)
+    save_mesh(tmp_path / f"mesh.{kind}", ball)
+    assert names(tmp_path) == {f"mesh.{kind}"}
+    read = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
+    assert read.vertices == pytest.approx(ball.vertices, abs=1e-6)
+    assert (read.faces == ball.faces).all()
+    assert (read.visual.vertex_colors[:, :3] == ball.visual.vertex_colors[:, :3]).all()
 
 
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
@@ -235,17 +314,17 @@ def test_complete_finds_where_the_shape_is(model: Path, run: Command, tmp_path: 
     ball.update_faces(ball.triangles_center[:, 2] > 8.5)
     ball.remove_unreferenced_vertices()
     ball.export(tmp_path / "part.ply")
-    options = ("--reference", tmp_path / "true.ply", "--resolution", 24, "--up", "z", "--strict")
+    options = ("--reference", tmp_path / "true.ply", "--resolution", 24, "--up", "z", "--strict", "--format", "obj")
     run("complete", model, tmp_path / "part.ply", *options, "--out", tmp_path / "out")
     out = tmp_path / "out"
-    assert names(out) == COMPLETED
+    assert names(out) == COMPLETED | {"mesh.obj"}
     facts = result(
         out, "evaluations", "verdict", "explained", "free_space_violated", "disagreement", "reason", "chamfer"
     )
     assert facts["verdict"] == "trusted"
     matrix = np.array(json.loads((out / "placement.json").read_text())["T_input_object"])
     assert np.abs(matrix[:3, 3] - (5.0, -3.0, 9.0)).max() < 0.15
-    for name in ("mesh.ply", "mesh.glb"):
+    for name in ("mesh.ply", "mesh.glb", "mesh.obj"):
         vertices = trimesh.load(out / name, process=False, force="mesh").vertices
         assert np.linalg.norm(vertices - (5.0, -3.0, 9.0), axis=1).mean() == pytest.approx(1.2, abs=0.06)
     page = (out / "report.html").read_text(encoding="utf-8")
@@ -474,6 +553,13 @@ BAD = [
     ("render {model} --size 4000000", "not enough memory"),
     ("render {model} --strategy dynamic --steps 0", "steps=0"),
     ("render {model} --steps 5", "fast counts none"),
+    ("render {model} --samples 0", "--samples 0 was given; give a whole number from 1 to 16"),
+    ("render {model} --background 1,2", "--background 1,2 was given; give white, transparent, or R,G,B"),
+    ("render {model} --background 1,2,256", "--background 1,2,256 was given"),
+    ("render {model} --background a,1,2,3", "--background a,1,2,3 was given"),
+    ("render {model} --light 30", "--light 30 was given; give AZIMUTH,ELEVATION"),
+    ("render {model} --light 30,inf", "--light 30,inf was given"),
+    ("render {model} --orbit 4 --background transparent", "a movie needs a colour"),
     ("render {model} --orbit 1", "an orbit of 1 frames"),
     ("render {model} --orbit 0", "an orbit of 0 frames"),
     ("render {model} --orbit -3", "an orbit of -3 frames"),
@@ -490,8 +576,14 @@ BAD = [
     ("render {model} --device tpu", "--device tpu is no device"),
     ("render {model} --device mps", "--device mps is not supported"),
     ("mesh {model} --resolution 3", "resolution of 3"),
+    ("shapes {model} --thumbnails -1", "--thumbnails -1 was given"),
+    ("shapes {model} --thumbnails some", "--thumbnails"),
+    ("shapes {tmp}/nothing", "no specs.json"),
     ("mesh {model} --resolution 20", "resolution of 20"),
     ("mesh {model} --code 9", "code 9"),
+    ("mesh {model} --format stl", "Invalid choice 'stl'"),
+    ("mesh {model} --format", "--format was given without a format"),
+    ("complete {model} {view} --format stl", "Invalid choice 'stl'"),
     ("bench trace {model} --size 0", "0 × 0"),
     ("bench everything {model}", "trace"),
     ("bench trace", "bench trace was given no model"),
@@ -620,6 +712,16 @@ def test_names_that_look_like_markup_are_printed_as_they_are(
     with progress("[/a]", 1) as bar:
         bar.advance("[/b] :smile:")
     assert "[/b] :smile:" in capsys.readouterr().out
+
+
+def test_a_bar_is_full_where_fewer_steps_were_needed(capsys: pytest.CaptureFixture) -> None:
+    with progress("fitting", 228) as bar:
+        bar.advance(to=56)
+    assert "56/56" in capsys.readouterr().out
+    with suppress(KeyboardInterrupt), progress("fitting", 228) as bar:
+        bar.advance(to=56)
+        raise KeyboardInterrupt
+    assert "56/228" in capsys.readouterr().out
 
 
 def test_a_closed_pipe_ends_what_is_printed_not_the_command(model: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ ORDER = [
     *("threads", "imports", "optional", "errors", "files", "processes", "equality", "image_cache", "pixels", "vectors"),
     *("rays", "viewpoint", "camera", "pose"),
     *("fields", "surface", "shading", "notebook", "checkpoints", "prior"),
-    *("tracing", "render", "boundary", "movie", "checking"),
+    *("tracing", "render", "boundary", "antialiasing", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photos", "reconstruction", "viewer", "public"),
     *("report", "benchmarks", "cli", "__main__"),

@@ -49,18 +49,19 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
         monkeypatch.setattr(f"distrace.report.views_page.{name}", 2)
     out = tmp_path / "out"
     given = [str(model), str(tmp_path / "views"), "--out", str(out), "--fixed"]
-    given += ["--starts", "1", "--rays", "500", "--resolution", "40"]
+    given += ["--starts", "1", "--rays", "500", "--resolution", "40", "--format", "glb", "ply"]
     monkeypatch.setattr("sys.argv", ["distrace", "multiview", *given])
     main()
-    wanted = {"mesh.ply", "code.npy", "report.html", "forming.gif", "result.json"}
+    wanted = {"mesh.ply", "mesh.glb", "code.npy", "report.html", "forming.gif", "transforms.json", "result.json"}
     assert {path.name for path in out.iterdir()} == wanted
     result = json.loads((out / "result.json").read_text())
     assert result["unit_sphere"] == {"centre": [3.0, 0.0, 0.0], "radius": 2.0}
     assert np.allclose(result["T_unit_object"], np.eye(4))
     assert np.load(out / "code.npy").shape == (4,)
-    mesh = trimesh.load(out / "mesh.ply")
-    assert mesh.centroid == pytest.approx([3.0, 0, 0], abs=0.8)
-    assert 1.0 < mesh.extents.max() < 4.0
+    for name in ("mesh.ply", "mesh.glb"):
+        mesh = trimesh.load(out / name, force="mesh")
+        assert mesh.centroid == pytest.approx([3.0, 0, 0], abs=0.8)
+        assert 1.0 < mesh.extents.max() < 4.0
 
 
 def test_a_folder_without_views_ends_in_one_sentence(

@@ -409,16 +409,17 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
     out = tmp_path / "out"
     few = ["--steps", 30, "--retouching", 5, "--sizes", 16, 32, "--rays", 128, "--width", 16]
-    run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4)
-    wanted = {"mesh.ply", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
+    run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4, "--format", "ply", "obj")
+    wanted = {"mesh.ply", "mesh.obj", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
     assert wanted <= {path.name for path in out.iterdir()}
     result = json.loads((out / "result.json").read_text())
     assert result["rows"][0]["views_held_out"] == 2
     assert result["rows"][0]["method"] == "ours"
     assert {"psnr", "psnr_corrected", "psnr_aligned"} <= result["rows"][0].keys()
-    mesh = trimesh.load(out / "mesh.ply")
-    assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)
-    assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1
+    for name in ("mesh.ply", "mesh.obj"):
+        mesh = trimesh.load(out / name)
+        assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)
+        assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1
 
 
 def test_photographs_without_masks_end_in_one_sentence(

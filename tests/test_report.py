@@ -1,6 +1,7 @@
 """The page of a completion, read back as a browser would."""
 
 import base64
+import gzip
 import io
 import json
 import math
@@ -13,6 +14,7 @@ import pytest
 import torch
 import trimesh
 from PIL import Image
+from plotly.offline import get_plotlyjs
 
 from distrace.camera import Camera
 from distrace.fields.primitives import sphere
@@ -81,10 +83,11 @@ def completion() -> Completion:
         truth=truth,
         losses={"start 1": [1.0, 0.5], "start 2": [0.9, 0.1, 0.01]},
         mesh=mesh,
-        truth_points=points * 0.6 / 0.62,
+        truth_surface=points * 0.6 / 0.62,
         chamfer=Chamfer(to=0.1234, from_=0.5678),
         facts={"model": "<script>alert(1)</script>", "seconds": "12.5"},
         chosen="start 2",
+        origin="model <i>balls</i> · distrace complete · distrace 1.2",
     )
 
 
@@ -178,7 +181,7 @@ def test_both_directions_of_the_chamfer_distance_are_told_with_their_unit(read: 
 
 def test_the_curves_have_their_names_and_the_chosen_start_is_told(read: Reader) -> None:
     assert "start 1" in read.text
-    assert "The shape shown is that of start 2." in read.text
+    assert "Bold: start 2, the start with the least loss at the end" in read.text
     assert len(read.all("svg")) == 1
 
 
@@ -196,14 +199,35 @@ def test_the_scene_holds_the_surface_the_observed_points_and_the_truth(read: Rea
 
 
 def test_plotly_is_inlined_once_and_only_where_something_turns(read: Reader) -> None:
-    assert sum(len(script) > 1_000_000 for script in read.scripts) == 1
+    (packed,) = (script for script in read.scripts if len(script) > 1_000_000)
+    assert gzip.decompress(base64.b64decode(packed)).decode() == get_plotlyjs()
     still = html.page("Still", "No view", [html.section("Table", html.table(("a",), [("1",)]))])
     assert len(still) < 10_000
     assert not Reader(still).scripts
 
 
+def test_a_true_mesh_is_a_surface_that_the_legend_shows(completion: Completion) -> None:
+    truth = trimesh.creation.box(extents=(1.0, 1.0, 1.0))
+    completed, true, observed = scene_of(Reader(completion_page(replace(completion, truth_surface=truth))))["data"]
+    assert [each["type"] for each in (completed, true, observed)] == ["mesh3d", "mesh3d", "scatter3d"]
+    assert true["name"] == "True surface"
+    assert true["visible"] == "legendonly"
+    assert "visible" not in completed
+    assert true["color"] != completed["color"]
+
+
+def test_the_page_says_what_made_it(page: str, read: Reader) -> None:
+    assert "model <i>balls</i> · distrace complete · distrace 1.2" in read.text
+    assert "<i>balls" not in page
+
+
+def test_a_page_of_a_fine_mesh_stays_small(completion: Completion) -> None:
+    fine = trimesh.creation.icosphere(subdivisions=6, radius=0.62)
+    assert len(completion_page(replace(completion, mesh=fine))) < 2_700_000
+
+
 def test_a_page_without_truth_or_silhouette_leaves_out_what_it_cannot_know(completion: Completion) -> None:
-    unknown = replace(completion, truth=None, truth_points=None, chamfer=None, observed_mask=None, chosen=None)
+    unknown = replace(completion, truth=None, truth_surface=None, chamfer=None, observed_mask=None, chosen=None)
     read = Reader(completion_page(unknown))
     assert "Distance to the truth" not in read.text
     assert "Truth" not in read.text

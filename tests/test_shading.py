@@ -121,6 +121,29 @@ def test_an_error_is_blue_where_too_near_and_red_where_too_far_and_stops_at_the_
     assert (far == farther).all()
 
 
+def test_means_are_of_light_and_not_of_the_values_of_a_picture() -> None:
+    black_and_white = np.zeros((2, 2, 3), np.uint8)
+    black_and_white[0] = 255
+    mean = shading.mean_light(black_and_white, np.ones((2, 2), bool), 2, None)
+    assert mean[0, 0, 0] == round(255 * 0.5 ** (1 / 2.2)) == 186
+
+
+def test_a_background_lies_behind_what_the_mask_does_not_cover() -> None:
+    red = np.full((2, 4, 3), (200, 0, 0), np.uint8)
+    mask = np.array([[True, True, True, False], [True, True, False, False]])
+    ((inside, quarter),) = shading.mean_light(red, mask, 2, None).tolist()
+    assert inside == [200, 0, 0, 255]
+    assert quarter == [200, 0, 0, 64], "transparency does not darken the colour"
+    ((inside, quarter),) = shading.mean_light(red, mask, 2, (0, 0, 255)).tolist()
+    assert inside == [200, 0, 0]
+    assert quarter == [round(200 * 0.25 ** (1 / 2.2)), 0, round(255 * 0.75 ** (1 / 2.2))]
+
+
+def test_one_sample_over_white_is_the_picture_itself(seen: Buffers) -> None:
+    shaded = pictures(seen)["shaded"]
+    assert (shading.mean_light(shaded, seen.mask, 1, shading.WHITE) == shaded).all()
+
+
 def test_dots_lie_on_their_pixels_and_nowhere_else() -> None:
     depth = torch.full((100, 100), torch.inf)
     depth[20, 70] = 3.0

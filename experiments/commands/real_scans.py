@@ -9,7 +9,7 @@ import tyro
 
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
-from distrace.cli.common import save_completed, show_table
+from distrace.cli.common import save_meshes, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.data.scan_files import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
@@ -68,7 +68,7 @@ def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
     mesh.apply_transform(fit.place.T_world_object.double().numpy())
     folder = start(out / given.name).out
     save_code(folder, fit.code, fit.place)
-    save_completed(folder, mesh)
+    save_meshes(folder, mesh, ("ply",))
     verdict = fit.verdict
     return {
         "input": given.name,

@@ -12,6 +12,7 @@ from distrace.files import written
 
 Array = Tensor | np.ndarray
 Picture = UInt8[np.ndarray, "_ _ 3"]  # of any size: some are larger than what they are drawn from
+Rgba = UInt8[np.ndarray, "_ _ 4"]
 Colour = tuple[int, int, int]
 
 COLOUR_MAPS = ("viridis", "coolwarm")  # the rows of colour_maps.png, so that pictures need no matplotlib
@@ -22,6 +23,7 @@ AGREE: Colour = (200, 206, 214)
 MISSING: Colour = (226, 112, 32)
 EXTRA: Colour = (44, 104, 190)
 CLAY = np.array([0.60, 0.53, 0.46])  # linear light
+GAMMA = 2.2  # of linear light to the values of pictures
 
 
 def depth_picture(depth: Float[Array, "height width"], near: float | None = None, far: float | None = None) -> Picture:
@@ -83,12 +85,29 @@ def shaded_picture(
     """
     n, towards = _numpy(normal).astype(float), -_numpy(directions).astype(float)
     facing = np.clip((n * towards).sum(-1), 0, 1)
-    to_light = _key_light(towards) if light is None else _unit(light)
+    to_light = key_light(directions) if light is None else _unit(light)
     key = np.clip((n @ to_light + 0.25) / 1.25, 0, 1) ** 1.4  # wraps around the edge of the shadow
     sky = 0.5 + 0.5 * n[..., 1]
     rim = (1 - facing) ** 4 * sky
     brightness = 0.04 + 0.18 * sky + 0.20 * facing + 0.80 * key + 0.25 * rim
-    return _over_white((brightness[..., None] * CLAY) ** (1 / 2.2), _numpy(mask))
+    return _over_white((brightness[..., None] * CLAY) ** (1 / GAMMA), _numpy(mask))
+
+
+def mean_light(
+    picture: Picture, mask: Bool[Array, "height width"], samples: int, background: Colour | None
+) -> Picture | Rgba:
+    """Averages `samples` × `samples` pixels to one in linear light, and puts a background where the mask is not.
+
+    Without a background the picture is transparent there: the fourth channel is the share that the mask covers.
+    """
+    inside = _numpy(mask)[..., None].astype(float)
+    light = _block_means(inside * (picture / 255) ** GAMMA, samples)
+    coverage = _block_means(inside, samples)
+    if background is None:
+        colours = (light / np.maximum(coverage, 1e-12)) ** (1 / GAMMA)
+        return np.rint(255 * np.concatenate([colours, coverage], axis=2)).astype(np.uint8)
+    behind = (np.array(background) / 255) ** GAMMA
+    return colour_picture((light + (1 - coverage) * behind) ** (1 / GAMMA))
 
 
 def heat_picture(values: Float[Array, "height width"], mask: Bool[Array, "height width"]) -> Picture:
@@ -148,7 +167,7 @@ def grid(rows: Sequence[Sequence[Picture]], gap: int = 8) -> Picture:
     return canvas
 
 
-def save_png(path: str | Path, picture: Picture) -> None:
+def save_png(path: str | Path, picture: Picture | Rgba) -> None:
     """Writes a picture as PNG; the folder is made if it is missing."""
     from PIL import Image
 
@@ -156,12 +175,20 @@ def save_png(path: str | Path, picture: Picture) -> None:
         Image.fromarray(picture).save(file, format="PNG", optimize=True)
 
 
-def _key_light(towards: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
-    """A light over the camera's left shoulder; the camera's up is z, not y, where it looks straight down."""
-    back = _unit(towards.mean((0, 1)))
+def key_light(directions: Float[Array, "height width 3"]) -> Float[np.ndarray, "3"]:
+    """The direction to a light over the left shoulder of the camera of these rays.
+
+    The camera's up is z, not y, where it looks straight down.
+    """
+    back = _unit(-_numpy(directions).astype(float).mean((0, 1)))
     up = np.array([0.0, 1.0, 0.0] if abs(back[1]) < 0.999 else [0.0, 0.0, 1.0])
     right = _unit(np.cross(up, back))
     return _unit(0.6 * back - 0.65 * right + 0.75 * np.cross(back, right))
+
+
+def _block_means(image: Float[np.ndarray, "height width channels"], side: int) -> Float[np.ndarray, "_ _ channels"]:
+    height, width, channels = image.shape
+    return image.reshape(height // side, side, width // side, side, channels).mean((1, 3))
 
 
 def _mapped(name: str, values: Float[np.ndarray, "height width"]) -> Float[np.ndarray, "height width 3"]:

@@ -40,6 +40,11 @@ COMMANDS: Commands = {
         "distrace.cli.complete", "Demo", "Complete the bundled sofa, held out of training, from 100 depths and a mask."
     ),
     "render": Lazy("distrace.cli.show", "Render", "Render one view: depth, normals, mask and a shaded picture."),
+    "shapes": Lazy(
+        "distrace.cli.shapes",
+        "Shapes",
+        "List the training shapes of a model by number and name; --thumbnails also draws them.",
+    ),
     "mesh": Lazy("distrace.cli.show", "Mesh", "Extract a mesh by marching cubes."),
     "complete": Lazy(
         "distrace.cli.complete",

@@ -4,7 +4,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import torch
 import tyro
@@ -17,8 +17,8 @@ from distrace.cli.console import Run, console
 from distrace.files import save_arrays, written
 from distrace.metrics import Chamfer
 from distrace.render import Buffers
-from distrace.report.completion_page import View
 from distrace.report.page import short
+from distrace.shading import Picture, Rgba
 
 if TYPE_CHECKING:
     import trimesh
@@ -38,6 +38,7 @@ CodeName = Annotated[
     str, tyro.conf.arg(metavar="CODE", help="a training shape's number or name, or a code.npy that a command wrote")
 ]
 Flag = Annotated[bool, tyro.conf.FlagCreatePairsOff]
+Format = Literal["ply", "glb", "obj"]
 
 
 def default(value: object, metavar: str | None = None) -> Any:
@@ -108,12 +109,12 @@ class Orbit:
         )
 
 
-def save_pictures(folder: Path, buffers: Buffers, camera: Camera) -> None:
+def save_pictures(folder: Path, buffers: Buffers, camera: Camera, shaded: Picture | Rgba, mask: Picture) -> None:
     pictures = {
         "depth": shading.depth_picture(buffers.depth),
         "normal": shading.normal_picture(buffers.normal, buffers.mask, camera.T_world_camera),
-        "mask": shading.mask_picture(buffers.mask),
-        "shaded": View.of(buffers).shaded,
+        "mask": mask,
+        "shaded": shaded,
     }
     for name, image in pictures.items():
         shading.save_png(folder / f"{name}.png", image)
@@ -128,15 +129,23 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
 
 
 def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a mesh in the format of the name: PLY or GLB."""
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices."""
+    kind = path.suffix.removeprefix(".")
+    options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
     with written(path) as file:
-        mesh.export(file, file_type=path.suffix.removeprefix("."))
+        mesh.export(file, file_type=kind, **options)
 
 
-def save_completed(folder: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a completed mesh in both formats."""
-    save_mesh(folder / "mesh.ply", mesh)
-    save_mesh(folder / "mesh.glb", mesh)
+def save_meshes(folder: Path, mesh: "trimesh.Trimesh", formats: Sequence[Format]) -> None:
+    """Writes `mesh.ply`, `mesh.glb` or `mesh.obj`: one file for each format."""
+    for kind in dict.fromkeys(formats):
+        save_mesh(folder / f"mesh.{kind}", mesh)
+
+
+def check_formats(formats: Sequence[Format]) -> None:
+    """Raises `ValueError` where no format was given, so that no mesh would be written."""
+    if not formats:
+        raise ValueError("--format was given without a format; name ply, glb, obj, or several of them")
 
 
 def chamfer_facts(distances: Chamfer) -> tuple[dict[str, float], str]:

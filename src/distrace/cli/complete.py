@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from distrace.cli.common import NONE, Flag, ModelName, default, opened_for
-from distrace.cli.completion import Task, complete
+from distrace.cli.common import NONE, Flag, Format, ModelName, default, opened_for
+from distrace.cli.completion import COMPLETED, Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
@@ -66,6 +66,8 @@ class Complete:
     points: Annotated[int | None, default("all", "INT")] = None  # number of the object's points to use, at random
     seed: int = 0
     resolution: int = 128  # cells along each side of the mesh's grid; 256 keeps parts thinner than 1/64 whole
+    format: Annotated[tuple[Format, ...], tyro.conf.arg(help_behavior_hint="(default: ply glb)")] = ()
+    """of the mesh, besides ply and glb"""
     device: str = "cpu"
     ignore: Annotated[tuple[Literal["mask", "normal"], ...], NONE] = ()
     """canonical: parts to ignore; only adam uses a view's normals"""
@@ -90,6 +92,10 @@ class Complete:
         if self.strict and verdict.name == "failed":
             sys.exit(FAILED)
 
+    @property
+    def formats(self) -> tuple[Format, ...]:
+        return (*COMPLETED, *self.format)
+
     def _refuse(self, frame: str) -> None:
         """Raises `ValueError` for options of the other frame, which would do nothing."""
         names = ("up", "intrinsics", "poses", "mask", "box")
@@ -103,7 +109,7 @@ class Complete:
         scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box, self.poses))
         scan = scan if self.points is None else scan.sparse(self.points, self.seed)
         truth = None if self.reference is None else _reference(self.reference)
-        return complete_scan(run, ScanTask(opened_for(run, self.model), scan, truth, mesh, self.seed))
+        return complete_scan(run, ScanTask(opened_for(run, self.model), scan, truth, mesh, self.seed, self.formats))
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
         if len(self.inputs) > 1:
@@ -120,7 +126,8 @@ class Complete:
         known = full if self.points is None else full.sparse(self.points, self.seed)
         self._check(path, known, chosen)
         truth = None if self.reference is None else _reference(self.reference)
-        return complete(run, Task(opened_for(run, self.model), full, known, truth, fit, mesh, self.plausible))
+        task = Task(opened_for(run, self.model), full, known, truth, fit, mesh, self.plausible, self.formats)
+        return complete(run, task)
 
     def _check(self, path: Path, known: View | Cloud, chosen: type[CodeFitConfig | FitConfig]) -> None:
         """Raises `ValueError` where nothing that the solver uses is left."""

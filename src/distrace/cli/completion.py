@@ -1,6 +1,6 @@
 """A completion in the canonical frame: the fit, the mesh, the distance to the truth, the verdict, and the page."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +13,7 @@ from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_completed, save_mesh
+from distrace.cli.common import Format, chamfer_facts, save_mesh, save_meshes
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
@@ -35,6 +35,7 @@ from distrace.report import completion_page as report
 if TYPE_CHECKING:
     import trimesh
 
+COMPLETED: tuple[Format, ...] = ("ply", "glb")  # always written
 CLOUD_SIZE = 256  # pixels along each side of the pictures of a cloud's completion
 SMALL = 144  # pixels along each side of the pictures of other completions
 SPREAD = 0.1  # distance between completions that is drawn in the fullest colour
@@ -51,6 +52,7 @@ class Task:
     fit: FitConfig | CodeFitConfig
     mesh: MeshConfig
     plausible: int = 0  # number of other completions
+    formats: tuple[Format, ...] = COMPLETED
 
     @property
     def camera(self) -> Camera:
@@ -82,10 +84,10 @@ def complete(run: Run, task: Task) -> Verdict:
     save_code(run.out, fit.code, Similarity.identity())
     save_scan(run.out / "scan.npz", canonical_scan(task.known))
     outcome = _outcome(task, fit)
-    save_completed(run.out, outcome.mesh)
+    save_meshes(run.out, outcome.mesh, task.formats)
     for number, code in enumerate(outcome.others, 1):
         save_mesh(run.out / f"plausible-{number}.ply", task.surface(code))
-    content = _page_content(task, outcome)
+    content = replace(_page_content(task, outcome), origin=run.origin)
     shading.save_png(run.out / "shaded.png", content.after.shaded)
     with run.optional("report.html"):
         save_text(run.out / "report.html", report.completion_page(content))
@@ -122,7 +124,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, code)
         camera = task.camera.to(task.mesh.device)
-        before, after = (report.View.of(render(task.model.field(code), camera)) for code in codes)
+        before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
     facts = {
         "points used": str(len(points)),
@@ -150,7 +152,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         others=_other_pictures(task, outcome) if outcome.others else [],
         losses=outcome.fit.losses,
         mesh=outcome.mesh,
-        truth_points=task.truth if isinstance(task.truth, np.ndarray | None) else task.truth.vertices,
+        truth_surface=task.truth,
         chamfer=outcome.chamfer,
         facts=facts,
         chosen=next(iter(outcome.fit.losses)),
@@ -169,7 +171,7 @@ def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
         distance[buffers.mask] = spread(model, codes, buffers.points)
-        pictures = [report.View.of(render(model.field(code), eye)).shaded for code in codes]
+        pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows
 

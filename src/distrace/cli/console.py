@@ -55,6 +55,12 @@ class Run:
     warnings: list[str] = field(default_factory=list)  # sentences
     model: str | None = None  # that the result is of, so that other commands can load it
 
+    @property
+    def origin(self) -> str:
+        """The line of a page that says what made it."""
+        model = [] if self.model is None else [f"model {self.model}"]
+        return " · ".join([*model, " ".join(sys.argv), f"distrace {distrace.__version__}"])
+
     def warn(self, sentence: str) -> None:
         """Prints a sentence on stderr, once, and keeps it for `result.json`."""
         if sentence not in self.warnings:
@@ -128,7 +134,7 @@ def device_name(device: torch.device) -> str:
 
 @contextmanager
 def progress(description: str, total: int) -> Iterator["Bar"]:
-    """A bar with the remaining time, and a few words that change with each step."""
+    """A bar with the remaining time, and a few words that change with each step. It is full at the end."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -139,7 +145,9 @@ def progress(description: str, total: int) -> Iterator["Bar"]:
         TextColumn("{task.fields[words]}", markup=False),
     )
     with Progress(*columns, console=console) as bars:
-        yield Bar(bars, bars.add_task(description, total=total, words=""))
+        bar = Bar(bars, bars.add_task(description, total=total, words=""))
+        yield bar
+        bar.finish()
 
 
 @dataclass
@@ -160,6 +168,10 @@ class Bar:
             task = self.bars.tasks[self.task]
             console.print(f"{task.description} {task.completed:.0f}/{task.total:.0f} {words}")
             self.printed = time.monotonic()
+
+    def finish(self) -> None:
+        """Makes the bar full where fewer steps than expected were needed."""
+        self.bars.update(self.task, total=self.bars.tasks[self.task].completed or None)
 
 
 def machine() -> str:

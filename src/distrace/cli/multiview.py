@@ -11,7 +11,7 @@ import tyro
 
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Flag, ModelName, Views, opened_for, save_mesh
+from distrace.cli.common import Flag, Format, ModelName, Views, check_formats, opened_for, save_meshes
 from distrace.cli.console import console, progress, start
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
@@ -46,10 +46,12 @@ class Multiview:
     size: int = 1024  # pixels along the longer side; larger photographs are scaled down
     rays: int = ComparisonConfig.rays  # of all views together, in each round
     resolution: int = 256  # cells along each side of the mesh's grid
+    format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
     seed: int = 0
     device: str = "cpu"
 
     def run(self) -> None:
+        check_formats(self.format)
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
         model = opened_for(run, self.model)
@@ -73,7 +75,7 @@ class Multiview:
             if view.is_outlier:
                 run.warn(_doubt(view))
         mesh = _mesh(model, last, found, resolved)
-        save_mesh(run.out / "mesh.ply", mesh)
+        save_meshes(run.out, mesh, self.format)
         save_code(run.out, last.code)
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):

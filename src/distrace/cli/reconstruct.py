@@ -7,7 +7,7 @@ from typing import Annotated
 
 import tyro
 
-from distrace.cli.common import NONE, Every, Flag, Views
+from distrace.cli.common import NONE, Every, Flag, Format, Views, check_formats
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
 from distrace.data.photograph import Photograph
@@ -51,6 +51,7 @@ class Reconstruct:
     held_out: int = 8  # compare one view in so many instead of fitting to it; 0 for none
     leave_out: Annotated[tuple[str, ...], NONE] = ()  # names of views to ignore
     resolution: int = 256  # cells along each side of the mesh's grid
+    format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
     seed: int = 0
     save_every: float = 60.0  # seconds between checkpoints
     device: str = "cpu"
@@ -58,6 +59,7 @@ class Reconstruct:
     @flushed_denormals()
     def run(self) -> None:
         saving = Every(self.save_every)
+        check_formats(self.format)
         from distrace.data.background_segmentation import masked  # brings scikit-image
 
         run = start(self.out, self.device)
@@ -72,7 +74,8 @@ class Reconstruct:
         fitted_to, held_out = parted(found.views, self.held_out)
         with alone(run.out):
             state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
-            Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out).save(run, resolved)
+            found_shape = Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out)
+            found_shape.save(run, resolved, self.format)
 
     @property
     def config(self) -> ReconstructConfig:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from distrace.cli.common import save_mesh
+from distrace.cli.common import Format, save_meshes
 from distrace.cli.console import Run, device_name
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photograph import Photograph
@@ -41,7 +41,7 @@ class Reconstructed:
     fitted_to: Sequence[Photograph]
     held_out: Sequence[Photograph]
 
-    def save(self, run: Run, config: MeshConfig) -> None:
+    def save(self, run: Run, config: MeshConfig, formats: Sequence[Format]) -> None:
         """Writes the mesh in the folder's world, the page, the film and `result.json`."""
         mesh = coloured_mesh(self.state, config)
         held_out = self._judged(self.held_out)
@@ -51,7 +51,7 @@ class Reconstructed:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
         mesh.vertices = self.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
-        save_mesh(run.out / "mesh.ply", mesh)
+        save_meshes(run.out, mesh, formats)
         rows = self._rows(held_out)
         refined = {view.name: self.placement.camera_to_world(view.camera) for view in self._refined}
         save_cameras(run.out / "transforms.json", refined)

@@ -7,10 +7,11 @@ import numpy as np
 import torch
 
 from distrace import shading
+from distrace.antialiasing import smooth_outline
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import chamfer_facts, save_completed
+from distrace.cli.common import Format, chamfer_facts, save_meshes
 from distrace.cli.console import Run, console, progress
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import Scan
@@ -22,7 +23,6 @@ from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.render import render
-from distrace.report.completion_page import View
 from distrace.report.scan_page import scan_page
 
 if TYPE_CHECKING:
@@ -47,6 +47,7 @@ class ScanTask:
     truth: "trimesh.Trimesh | np.ndarray | None"  # in the scan's frame
     mesh: MeshConfig
     seed: int
+    formats: tuple[Format, ...]
 
 
 def complete_scan(run: Run, task: ScanTask) -> Verdict:
@@ -57,7 +58,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     save_scan(run.out / "scan.npz", task.scan)
     mesh = extract_mesh(task.model.field(fit.code), task.mesh)
     mesh.apply_transform(place.T_world_object.double().numpy())
-    save_completed(run.out, mesh)
+    save_meshes(run.out, mesh, task.formats)
     pictures = _pictures(task, fit, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
     facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}
@@ -76,6 +77,8 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
             losses=fit.losses,
             place=place,
             facts=_facts(task, fit),
+            truth=task.truth,
+            origin=run.origin,
         )
         save_text(run.out / "report.html", content)
     run.finish(facts, *lines)
@@ -101,7 +104,8 @@ def _pictures(task: ScanTask, fit: ScanFit, place: Similarity) -> dict[str, shad
         cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, PICTURE / max(view.depth.shape))))
     for name, (azimuth, elevation) in VIEWS.items():
         cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
-    return {name: View.of(render(sdf, camera.to(task.mesh.device))).shaded for name, camera in cameras.items()}
+    on_device = {name: camera.to(task.mesh.device) for name, camera in cameras.items()}
+    return {name: smooth_outline(render(sdf, camera), camera) for name, camera in on_device.items()}
 
 
 def _in_object(shape: "trimesh.Trimesh | np.ndarray", place: Similarity) -> "trimesh.Trimesh | np.ndarray":

@@ -1,6 +1,6 @@
 """`render` and `mesh`: images and meshes of a model."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -9,20 +9,24 @@ import numpy as np
 import torch
 import tyro
 
+from distrace.antialiasing import Style
 from distrace.camera import Camera
 from distrace.checkpoints.codes import named_code
 from distrace.cli.common import (
     CodeName,
     Flag,
+    Format,
     ModelName,
     Orbit,
+    check_formats,
     default,
     opened_for,
     save_buffers,
-    save_mesh,
+    save_meshes,
     save_pictures,
 )
 from distrace.cli.console import progress, start
+from distrace.cli.style import parsed_style
 from distrace.data.observation import View as Observation
 from distrace.data.observation import save_view
 from distrace.fields.base import Counted
@@ -30,7 +34,6 @@ from distrace.mesh import MeshConfig, extract_mesh
 from distrace.movie import filmed, save_gif, save_mp4, turntable
 from distrace.optional import require
 from distrace.render import STRATEGIES, Buffers, Config
-from distrace.report.completion_page import View
 from distrace.shading import Picture
 from distrace.tracing.sphere_tracing import Outcome, Trace, TraceConfig
 
@@ -71,35 +74,54 @@ class Render(Orbit):
     """fast is distrace's tracer; the others are DIST's strategies"""
     steps: Annotated[int | None, default("the strategy's", "INT")] = None  # maximum for a ray; not for fast
     clearance: Flag = False  # also write the least distance on each ray that misses, at the cost of evaluations
+    samples: int = 1  # rays along each side of a pixel, averaged in shaded.png, mask.png and the movie
+    background: Annotated[str, tyro.conf.arg(metavar="white|transparent|R,G,B")] = "white"  # of shaded.png, the movie
+    light: Annotated[str | None, default("over the camera's left shoulder", "AZIMUTH,ELEVATION")] = None
+    """direction to the light in degrees, as the camera's"""
     device: str = "cpu"
 
     def run(self) -> None:
+        style = parsed_style(self.samples, self.background, self.light)
         if self.orbit is not None:
             require("--orbit", "av")
+            if style.background is None:
+                raise ValueError("--background transparent was given with --orbit; a movie needs a colour")
         run = start(self.out, self.device)
         camera = self.camera().to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
         model = opened_for(run, self.model)
-        counted = Counted(model.field(named_code(model, self.code)))
+        field = model.field(named_code(model, self.code))
+        counted = Counted(field)
+        finer = Counted(field)  # of the further rays a pixel
         with torch.no_grad(), run.noticing():
-            views = self._saving_first(filmed(counted, cameras, config=self._config()), camera)
+            drawn = self._drawn(filmed(counted, cameras, config=self._config()), cameras, style, finer)
             tallies = (
-                [Tally.of(view.trace) for view in views] if self.orbit is None else _movie(run.out, views, self.orbit)
+                [Tally.of(first.trace) for first, _ in drawn]
+                if self.orbit is None
+                else _movie(run.out, drawn, self.orbit)
             )
         facts = _facts(tallies, counted.evaluations)
+        if self.samples > 1:
+            facts["sample_evaluations"] = finer.evaluations
         pixels = self.size * self.size * len(tallies)
         summary = f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations"
         frames = {} if self.orbit is None else _each(tallies)
         run.finish({**facts, "strategy": self.strategy, **frames}, summary)
 
-    def _saving_first(self, views: Iterator[Buffers], camera: Camera) -> Iterator[Buffers]:
-        """Yields the views; writes the pictures and arrays of the first, and an observation for other commands."""
-        first = next(views)
-        save_pictures(self.out, first, camera)
-        save_buffers(self.out / "buffers.npz", first, self.clearance)
-        save_view(self.out / "view.npz", Observation(camera, first.depth, first.mask, first.normal))
-        yield first
-        yield from views
+    def _drawn(
+        self, views: Iterator[Buffers], cameras: Sequence[Camera], style: Style, sdf: Counted
+    ) -> Iterator[tuple[Buffers, Picture]]:
+        """Yields the views and their shaded pictures.
+
+        Writes the pictures and arrays of the first, and an observation for other commands.
+        """
+        for number, (view, camera) in enumerate(zip(views, cameras)):
+            shaded, mask = style.draw(sdf, view, camera, self._config())
+            if number == 0:
+                save_pictures(self.out, view, camera, shaded, mask)
+                save_buffers(self.out / "buffers.npz", view, self.clearance)
+                save_view(self.out / "view.npz", Observation(camera, view.depth, view.mask, view.normal))
+            yield view, shaded
 
     def _config(self) -> Config:
         config = STRATEGIES[self.strategy]
@@ -112,14 +134,14 @@ class Render(Orbit):
         return replace(config, steps=self.steps)
 
 
-def _movie(folder: Path, views: Iterator[Buffers], frames: int) -> list[Tally]:
+def _movie(folder: Path, drawn: Iterator[tuple[Buffers, Picture]], frames: int) -> list[Tally]:
     """Writes the shaded views as a movie; returns the tally of each."""
     tallies: list[Tally] = []
     pictures: list[Picture] = []
     with progress("turning", frames) as bar:
-        for view in views:
+        for view, shaded in drawn:
             tallies.append(Tally.of(view.trace))
-            pictures.append(View.of(view).shaded)
+            pictures.append(shaded)
             bar.advance(f"{tallies[-1].evaluations} evaluations")
     save_mp4(folder / "turntable.mp4", np.stack(pictures))
     save_gif(folder / "turntable.gif", np.stack(pictures))
@@ -152,14 +174,16 @@ class Mesh:
     out: Path = Path("out/mesh")
     code: CodeName = "0"
     resolution: int = 256  # cells along each side of the cube around the unit sphere
+    format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
     device: str = "cpu"
 
     def run(self) -> None:
+        check_formats(self.format)
         run = start(self.out, self.device)
         model = opened_for(run, self.model)
         counted = Counted(model.field(named_code(model, self.code)))
         with run.noticing():
             surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
-        save_mesh(run.out / "mesh.ply", surface)
+        save_meshes(run.out, surface, self.format)
         evaluations = {"evaluations": counted.evaluations, "setup_evaluations": counted.evaluations}
         run.finish({**evaluations, "faces": len(surface.faces)}, f"{len(surface.faces)} faces")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from distrace.files import written
 from distrace.optional import require
-from distrace.report.page import Html
+from distrace.report.page import Html, paragraph, section
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,6 +35,17 @@ def curves(
         axes.legend(frameon=False)
     axes.set(xlabel=x_label, ylabel=y_label, yscale="log" if log else "linear")
     return as_html(chart)
+
+
+def starts_section(losses: Mapping[str, Sequence[float]], chosen: str | None) -> Html:
+    """Returns the section of a page with the loss of each start; the chosen one is bold."""
+    drawn = curves(losses, "iteration", "loss", all(value > 0 for curve in losses.values() for value in curve), chosen)
+    if chosen is None or len(losses) < 2:
+        return section("Loss", drawn)
+    about = (
+        f"Each curve is one start of the fit. Bold: {chosen}, the start with the least loss at the end; it is shown."
+    )
+    return section("Loss", paragraph(about), drawn)
 
 
 def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:

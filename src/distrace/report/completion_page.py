@@ -9,10 +9,12 @@ import torch
 from jaxtyping import Bool, Float, UInt8
 
 from distrace import shading
+from distrace.antialiasing import smooth_outline
+from distrace.camera import Camera
 from distrace.fitting.judge import Verdict
 from distrace.metrics import POINTS, Chamfer, iou
 from distrace.render import Buffers
-from distrace.report.charts import curves
+from distrace.report.charts import starts_section
 from distrace.report.page import (
     Html,
     error_ramp,
@@ -27,7 +29,7 @@ from distrace.report.page import (
     table,
     verdict_banner,
 )
-from distrace.report.scene import space_section
+from distrace.report.scene import surfaces_section
 from distrace.shading import Picture
 
 if TYPE_CHECKING:
@@ -46,8 +48,12 @@ class View:
     shaded: UInt8[np.ndarray, "height width 3"]
 
     @staticmethod
-    def of(buffers: Buffers) -> "View":
-        shaded = shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
+    def of(buffers: Buffers, camera: Camera | None = None) -> "View":
+        """Returns the state as arrays; with its camera, the outline of the shaded picture is smooth."""
+        if camera is None:
+            shaded = shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
+        else:
+            shaded = smooth_outline(buffers, camera)
         depth, normal, mask = (image.detach().cpu().numpy() for image in (buffers.depth, buffers.normal, buffers.mask))
         return View(depth, normal, mask, shaded)
 
@@ -66,11 +72,12 @@ class Completion:
     truth: View | None
     losses: dict[str, list[float]]  # a curve for each start, or for each term
     mesh: "trimesh.Trimesh"
-    truth_points: Float[np.ndarray, "m 3"] | None
+    truth_surface: "trimesh.Trimesh | np.ndarray | None"  # a mesh, or points [m, 3]
     chamfer: Chamfer | None
     facts: dict[str, str]
     others: Sequence[Sequence[Picture]] = ()  # rows from the camera and from behind: the spread, then each
     chosen: str | None = None  # the curve whose result is shown
+    origin: str = ""  # the model, the command and the version
 
 
 def completion_page(completion: Completion) -> str:
@@ -84,24 +91,21 @@ def completion_page(completion: Completion) -> str:
     depth_key = ramp(f"near {near:.2f}", f"{far:.2f} far", shading.depth_picture(np.linspace(near, far, 9)[None]))
     normals = [figure(shading.normal_picture(view.normal, view.mask), name) for name, view in states.items()]
     axes = key({"faces +x": (255, 128, 128), "faces +y, up": (128, 255, 128), "faces +z": (128, 128, 255)})
-    clouds = {"Observed points": completion.points_world}
-    if completion.truth_points is not None:
-        clouds["Points of the true surface"] = completion.truth_points
     sections = [
         verdict_banner(completion.verdict),
         section("Observed", row(*_observed(completion, near, far)), depth_key),
         section("Shape", row(*(figure(view.shaded, name) for name, view in states.items()))),
-        space_section({"Completed surface": completion.mesh}, clouds),
+        surfaces_section(completion.mesh, {"Observed points": completion.points_world}, completion.truth_surface),
         *([_distances(completion.chamfer)] if completion.chamfer else []),
         _silhouettes(completion),
         section("Depth", row(*depths), depth_key, *_depth_errors(completion)),
         section("Normals", row(*normals), axes),
         *([_others(completion.others)] if completion.others else []),
-        _losses(completion),
+        starts_section(completion.losses, completion.chosen),
         facts_section(completion.facts),
     ]
     lead = f"A whole surface from {count} points: what was observed, the fitted shape and its errors."
-    return page(completion.title, lead, sections)
+    return page(completion.title, lead, sections, completion.origin)
 
 
 def _observed(completion: Completion, near: float, far: float) -> list[Html]:
@@ -172,10 +176,3 @@ def _others(pictures: Sequence[Sequence[Picture]]) -> Html:
     )
     shown = figure(shading.grid(pictures), "Spread, and the other shapes")
     return section("Other shapes that fit", paragraph(about), shown, error_ramp("0", "0.1 and more", 0.0))
-
-
-def _losses(completion: Completion) -> Html:
-    values = [value for curve in completion.losses.values() for value in curve]
-    drawn = curves(completion.losses, "iteration", "loss", all(value > 0 for value in values), completion.chosen)
-    note = [] if completion.chosen is None else [paragraph(f"The shape shown is that of {completion.chosen}.")]
-    return section("Loss", *note, drawn)

@@ -4,6 +4,7 @@ Functions escape the plain text that they take. They return `Html`, which other 
 """
 
 import base64
+import gzip
 import io
 import re
 from collections.abc import Mapping, Sequence
@@ -25,16 +26,21 @@ Html = NewType("Html", str)
 NUMBER = re.compile(r"–?|[-+−]?[\d.,]+(e[-+]?\d+)?\s?%?")  # an empty cell and a dash count as numbers
 
 
-def page(title: str, lead: str, sections: Sequence[Html]) -> str:
-    """Returns a document. Its policy forbids the browser to load anything; a page with a 3-D view includes Plotly."""
+def page(title: str, lead: str, sections: Sequence[Html], origin: str = "") -> str:
+    """Returns a document. Its policy forbids the browser to load anything; a page with a 3-D view includes Plotly.
+
+    `origin` is a line under the lead: the model, the command and the version.
+    """
     body = "\n".join(sections)
     scripts = ""
     if '<div class="scene"' in body:
         from plotly.offline import get_plotlyjs
 
-        scripts = f"<script>{get_plotlyjs()}</script>\n<script>{resource('scenes.js')}</script>"
+        packed = base64.b64encode(gzip.compress(get_plotlyjs().encode(), mtime=0)).decode()
+        scripts = f'<script id="plotly" type="text/plain">{packed}</script>\n<script>{resource("scenes.js")}</script>'
     template = Template(resource("page.html"))
-    return template.substitute(title=escape(title), lead=escape(lead), body=body, scripts=scripts)
+    made_by = f'<p class="origin">{escape(origin)}</p>' if origin else ""
+    return template.substitute(title=escape(title), lead=escape(lead), origin=made_by, body=body, scripts=scripts)
 
 
 def resource(name: str) -> str:
@@ -57,14 +63,14 @@ def paragraph(text: str) -> Html:
 
 
 def figure(picture: Picture, caption: str) -> Html:
-    """Returns a picture with its caption; a small picture is enlarged without smoothing."""
+    """Returns a picture with its caption; a tiny picture is enlarged without smoothing."""
     from PIL import Image
 
     encoded = io.BytesIO()
     Image.fromarray(picture).save(encoded, format="PNG", optimize=True)
     source = "data:image/png;base64," + base64.b64encode(encoded.getvalue()).decode()
     height, width = picture.shape[:2]
-    size = f'width="{width}" height="{height}"' + (' class="coarse"' if width < 200 else "")
+    size = f'width="{width}" height="{height}"' + (' class="coarse"' if width < 100 else "")
     text = escape(caption)
     return Html(f'<figure><img src="{source}" alt="{text}" {size}><figcaption>{text}</figcaption></figure>')
 

@@ -8,9 +8,9 @@ from jaxtyping import Float
 
 from distrace.fitting.judge import Verdict
 from distrace.pose import Similarity
-from distrace.report.charts import curves
+from distrace.report.charts import starts_section
 from distrace.report.page import facts_section, figure, page, paragraph, row, section, table, verdict_banner
-from distrace.report.scene import space_section
+from distrace.report.scene import surfaces_section
 from distrace.shading import Picture
 
 if TYPE_CHECKING:
@@ -34,11 +34,14 @@ def scan_page(
     losses: Mapping[str, Sequence[float]],
     place: Similarity,
     facts: Mapping[str, str],
+    truth: "trimesh.Trimesh | np.ndarray | None" = None,
+    origin: str = "",
 ) -> str:
     """Returns the page as HTML.
 
-    `observed` are the depths of each view; `pictures` the completion, by where it is seen from; `mesh` and `points` lie
-    in the input's frame; `losses` are those of each start.
+    `observed` are the depths of each view; `pictures` the completion, by where it is seen from; `mesh`, `points`
+    and `truth` lie in the input's frame; `losses` are those of each start, the best first; `origin` is the model, the
+    command and the version.
     """
     inputs = [figure(picture, "The observed depth of the object") for picture in observed]
     shapes = [figure(picture, f"The completion from {name}") for name, picture in pictures.items()]
@@ -48,8 +51,8 @@ def scan_page(
         ("distance of the other good fits, in radii of the unit sphere", f"{verdict.disagreement:.3f}"),
     ]
     turn = place.rotation.double().numpy()  # rows of the input's axes, columns of the object's
-    upright = mesh.copy()
-    upright.vertices = np.asarray(mesh.vertices) @ turn
+    if truth is not None:
+        truth = truth @ turn if isinstance(truth, np.ndarray) else _turned(truth, turn)
     matrix = [[f"{value:.4f}" for value in line] for line in place.T_world_object.tolist()]
     return page(
         "A shape completed in the frame of its input",
@@ -57,10 +60,17 @@ def scan_page(
         [
             verdict_banner(verdict),
             section("Shape", row(*inputs, *shapes)),
-            space_section({"Completed surface": upright}, {"Points of the input": points @ turn}),
+            surfaces_section(_turned(mesh, turn), {"Points of the input": points @ turn}, truth),
             section("Verdict", paragraph(ABOUT_VERDICT), table(("", ""), evidence)),
             section("Placement", paragraph(ABOUT_PLACEMENT), table([""] * 4, matrix)),
-            section("Loss", curves(losses, "iteration", "loss", True)),
+            starts_section(losses, next(iter(losses), None)),
             facts_section(facts),
         ],
+        origin,
     )
+
+
+def _turned(mesh: "trimesh.Trimesh", turn: Float[np.ndarray, "3 3"]) -> "trimesh.Trimesh":
+    turned = mesh.copy()
+    turned.vertices = np.asarray(mesh.vertices) @ turn
+    return turned

@@ -1,8 +1,9 @@
 """Interactive 3-D views of a page."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from html import escape
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,33 +17,54 @@ if TYPE_CHECKING:
     import plotly.graph_objects as go
     import trimesh
 
-MOST_FACES = 60_000
+MOST_FACES = 20_000
 MOST_POINTS = 8_000
 DIRECTION = (1.4, 0.8, 0.6)  # of the eye, in plotly's axes
 FIELD_OF_VIEW = math.pi / 4  # plotly's, upright
 ASPECT = 1.5  # a little less than pages have
 MARGIN = 1.08
+TRUE = "True surface"
+SURFACE_COLOURS = ("#cfc3b5", "#8fb3d6", *PALETTE)
 
 
-def space_section(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray] = {}) -> Html:
+def space_section(
+    meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray] = {}, hidden: Collection[str] = ()
+) -> Html:
     """Returns the section of a page with `scene`, and how to use it."""
-    usage = "Drag to turn. Buttons switch to moving and zooming; the legend hides and shows."
-    return section("In space", paragraph(usage), scene(meshes, clouds))
+    usage = "Drag to turn; + and −, or Ctrl and the wheel, zoom. A click on a name of the legend hides or shows it."
+    return section("In space", paragraph(usage), scene(meshes, clouds, hidden))
 
 
-def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray]) -> Html:
+def surfaces_section(
+    mesh: "trimesh.Trimesh", clouds: Mapping[str, np.ndarray], truth: "trimesh.Trimesh | np.ndarray | None"
+) -> Html:
+    """Returns the 3-D view of a completed surface; a true mesh is hidden until the legend shows it."""
+    meshes = {"Completed surface": mesh}
+    if isinstance(truth, np.ndarray):
+        return space_section(meshes, {**clouds, "Points of the true surface": truth})
+    if truth is None:
+        return space_section(meshes, clouds)
+    return space_section({**meshes, TRUE: truth}, clouds, hidden=(TRUE,))
+
+
+def scene(
+    meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarray], hidden: Collection[str] = ()
+) -> Html:
     """Returns an interactive view of meshes and clouds, y up; vertices keep their colours.
 
-    The legend lists each name, and hides or shows it.
+    The legend lists each name, and hides or shows it; those in `hidden` are hidden at first.
     """
     require("a 3-D view", "plotly")
     import plotly.graph_objects as go
 
-    surfaces = [_surface(name, mesh) for name, mesh in meshes.items()]
+    surfaces = [_surface(name, mesh, colour) for (name, mesh), colour in zip(meshes.items(), cycle(SURFACE_COLOURS))]
     points = [
         _cloud(name, cloud, colour) for (name, cloud), colour in zip(clouds.items(), ("#e2701f", "#2c68be", *PALETTE))
     ]
-    hidden = dict(visible=False)
+    for name, trace in zip((*meshes, *clouds), (*surfaces, *points)):
+        if name in hidden:
+            trace.visible = "legendonly"
+    no_axis = dict(visible=False)
     everything = np.concatenate([np.empty((0, 3)), *(mesh.vertices for mesh in meshes.values()), *clouds.values()])
     camera = dict(eye=dict(zip("xyz", _eye(everything))))
     layout = go.Layout(
@@ -51,7 +73,7 @@ def scene(meshes: "Mapping[str, trimesh.Trimesh]", clouds: Mapping[str, np.ndarr
         paper_bgcolor="rgba(0,0,0,0)",
         modebar=dict(bgcolor="rgba(0,0,0,0)", color="#98a2af", activecolor="#4477aa"),
         legend=dict(x=0.015, y=0.985, itemsizing="constant", bgcolor="rgba(0,0,0,0)"),
-        scene=dict(xaxis=hidden, yaxis=hidden, zaxis=hidden, aspectmode="data", camera=camera, dragmode="turntable"),
+        scene=dict(xaxis=no_axis, yaxis=no_axis, zaxis=no_axis, aspectmode="data", camera=camera, dragmode="turntable"),
     )
     content = str(go.Figure([*surfaces, *points], layout).to_json()).replace("<", "\\u003c")
     return Html(f'<script type="application/json">{content}</script><div class="scene"></div>')
@@ -69,7 +91,7 @@ def _eye(points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
     return (corners @ back + MARGIN * half / np.tan(FIELD_OF_VIEW / 2)).max() * back
 
 
-def _surface(name: str, mesh: "trimesh.Trimesh") -> "go.Mesh3d":
+def _surface(name: str, mesh: "trimesh.Trimesh", colour: str) -> "go.Mesh3d":
     import plotly.graph_objects as go
 
     vertices, faces = _decimated(np.hstack([mesh.vertices, _own_colours(mesh)]), np.asarray(mesh.faces))
@@ -77,9 +99,9 @@ def _surface(name: str, mesh: "trimesh.Trimesh") -> "go.Mesh3d":
     light = dict(ambient=0.32, diffuse=0.66, specular=0.1, roughness=0.8, fresnel=0.05)
     return go.Mesh3d(
         **_coordinates(vertices[:, :3]),
-        **dict(zip("ijk", faces.astype(np.int32).T)),
+        **dict(zip("ijk", faces.astype(np.uint16 if len(vertices) <= 1 << 16 else np.int32).T)),
         name=escape(name),
-        color="#cfc3b5",
+        color=colour,
         vertexcolor=colours if vertices.shape[1] > 3 else None,
         lighting=light,
         lightposition=dict(x=3, y=-2, z=6),
