@@ -399,7 +399,7 @@ def test_complete_by_levenberg_marquardt(model: Path, observation: Path, run: Co
 def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run("pose", model, observation, "--code", 1, "--azimuth", 80, "--distance", 3.2, "--starts", 2, "--out", out)
-    assert names(out) == {"result.json", "posed.npz", "filmstrip.png"}
+    assert names(out) == {"result.json", "posed.npz", "code.npy", "filmstrip.png"}
     found = result(out, "T_world_camera", "intrinsics", "share_of_rays_off", "iterations", "evaluations")
     assert np.linalg.norm(np.array(found["T_world_camera"])[:3, 3]) == pytest.approx(2.5, abs=0.1)
     assert load_view(out / "posed.npz").camera.T_world_camera.tolist() == found["T_world_camera"]
@@ -619,7 +619,7 @@ BAD = [
     ("pose {model} {tmp}/missing.npz", "missing.npz does not exist"),
     ("pose {model} {tmp}/empty", "empty is not an observation"),
     ("pose {model} {view} --code 7", "code 7 was given"),
-    ("pose {model} {view} --code {tmp}/text", "neither the number of a training shape nor a code.npy"),
+    ("pose {model} {view} --code {tmp}/text", "neither the number nor the name of a training shape"),
     ("pose {model} {view} --ignore depth mask", "view.npz: without its depth and mask it shows nothing"),
     ("pose {model} {empty}", "empty.npz: it shows nothing"),
     ("pose {model} {empty} --ignore normal", "empty.npz: without its normal it shows nothing"),

@@ -23,7 +23,8 @@ def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
         model.field(number)  # raises for a number that the model has not
         return model.codes[number]
     if not given.endswith(".npy"):
-        return model.code_of(given)
+        with explained(f"{given} is neither the number nor the name of a training shape, nor a code.npy"):
+            return model.code_of(given)
     with explained(f"{given} is no code that a command wrote", Path(given)):
         code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
         if code.shape != model.codes.shape[1:]:
