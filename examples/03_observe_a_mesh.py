@@ -1,6 +1,6 @@
 """Observes a mesh by one camera, for `distrace complete`, and samples its true surface, to measure against.
 
-    python examples/03_observe_a_mesh.py SPLIT SHAPE MESHES OUT
+    PYTHONPATH=. python examples/03_observe_a_mesh.py SPLIT SHAPE MESHES OUT
 
 Writes OUT/SHAPE.npz (depth, mask and normals, by Embree's ray casting) and OUT/SHAPE.ply (30,000 points of the outer
 surface). SPLIT is a CSV file. The bundled observation was made by this script.
@@ -14,10 +14,10 @@ import numpy as np
 import trimesh
 
 import distrace as dt
-from distrace.data.observation import observe, save_view
+from distrace.data.observation import save_view
 from distrace.data.shapes import read_split
-from distrace.data.solid import solid_of
 from distrace.metrics import POINTS, surface_points
+from experiments.datasets.solids import observe, solid_of
 
 split, name, meshes, out = sys.argv[1:5]
 (shape,) = (shape for shape in read_split(split) if shape.name == name)

@@ -547,7 +547,7 @@ BAD = [
     ("render {model} --out {tmp}/text", "text is a file; give another to write to"),
     ("render {model} --out {tmp}/text/below", "text is a file; give another to write to"),
     ("render {model} --code 2", "code 2 was given; spheres has 2"),
-    ("render {model} --code -1", "code -1 was given"),
+    ("render {model} --code -1", "-1 is neither the number nor the name of a training shape"),
     ("render {model} --size -3", "-3 × -3"),
     ("render {model} --size 0", "0 × 0"),
     ("render {model} --size 4000000", "not enough memory"),

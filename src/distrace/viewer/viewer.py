@@ -11,7 +11,6 @@ import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace import __version__
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.files import save_json, save_text, written
@@ -132,7 +131,7 @@ class Viewer:
         if handle is not None:
             picture, _ = shown.picture(shown.field.image(camera_of(handle, SAVED_ROWS)))
             save_png(folder / "picture.png", picture)
-        save_json(folder / "result.json", {"version": __version__, "model": scene.source, "title": scene.title})
+        save_json(folder / "result.json", {"model": scene.source, "title": scene.title})
         return folder
 
     def save_page(self, path: str | Path) -> None:
