@@ -83,10 +83,10 @@ def find_again(first: ObjectView, scene: View) -> ObjectView | None:
     on_object = torch.zeros_like(shown)
     on_object[shown] = first.inside[rows, columns]
     contradicting = float((ahead[on_object] > reach).float().mean())
-    if contradicting > MOST_CONTRADICTIONS:
+    if on_object.sum() >= LEAST_POINTS and contradicting > MOST_CONTRADICTIONS:
         raise ValueError(
             f"{contradicting:.0%} of its points where the first image shows the object lie before that; are the poses"
-            " camera-to-world, in metres, and in the images' order?"
+            " (--poses, or T_world_camera) camera-to-world, in the depths' unit, and in the images' order?"
         )
     near = torch.zeros_like(shown)
     box = (points > first.points.amin(0) - reach) & (points < first.points.amax(0) + reach)
