@@ -35,7 +35,7 @@ CAMERA = Camera.orbit(30, 20, 4.97, height=48, width=64)
 
 
 def test_bands_are_the_rows_of_the_whole_image(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("distrace.viewer.image.BAND", 640)
+    monkeypatch.setattr("distrace.viewer.live.BAND", 640)
     sphere = primitives.sphere(0.5)
     banded = TracedField(Scene("sphere", sphere)).image(CAMERA)
     assert len(banded.bands) == 5

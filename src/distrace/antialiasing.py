@@ -46,10 +46,8 @@ class Style:
 
     def _rendered(self, sdf: SDF, buffers: Buffers, camera: Camera, config: Config) -> Iterator[Buffers]:
         """Yields bands of the picture from the top, each with `samples` rays along both sides of a pixel."""
-        rows = max(1, BAND // (camera.width * self.samples**2))
-        for top in range(0, camera.height, rows):
-            band = camera.cropped(top, 0, rows, camera.width).resized(float(self.samples))
-            yield render(sdf, band, config=config, occupancy=buffers.occupancy)
+        for band in camera.bands(BAND // self.samples**2):
+            yield render(sdf, band.resized(float(self.samples)), config=config, occupancy=buffers.occupancy)
 
 
 @torch.no_grad()

@@ -1,6 +1,7 @@
 """Pinhole cameras: OpenCV axes (x right, y down, z forward), pixel centres at +0.5, `T_world_camera`."""
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -197,6 +198,12 @@ class Camera(ByValue):
         height = min(height, self.height - top)
         width = min(width, self.width - left)
         return replace(self, intrinsics=intrinsics, height=height, width=width)
+
+    def bands(self, pixels: int) -> Iterator["Camera"]:
+        """Yields the cameras of bands of rows, from the top, each of at most so many pixels, or of one row."""
+        rows = max(1, pixels // self.width)
+        for top in range(0, self.height, rows):
+            yield self.cropped(top, 0, rows, self.width)
 
     def turned(self, degrees: float) -> "Camera":
         """Returns the camera rotated about the world's y axis, anticlockwise from above."""

@@ -19,9 +19,7 @@ def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
     Raises `ValueError`, in one sentence, for anything else.
     """
     if given.isdecimal():
-        number = int(given)
-        model.field(number)  # raises for a number that the model has not
-        return model.codes[number]
+        return model.code_of(int(given))
     if not given.endswith(".npy"):
         with explained(f"{given} is neither the number nor the name of a training shape, nor a code.npy"):
             return model.code_of(given)

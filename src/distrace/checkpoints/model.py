@@ -58,9 +58,7 @@ class Model(ByValue):
         """
         if isinstance(code, Tensor | np.ndarray):
             return self.decoder.field(code)
-        if not 0 <= code < len(self.codes):
-            raise ValueError(f"code {code} was given; {self.name} has {len(self.codes)}, counted from 0")
-        return self.decoder.field(self.codes[code])
+        return self.decoder.field(self.code_of(code))
 
     def __repr__(self) -> str:
         codes = summary(self.codes)
@@ -73,8 +71,12 @@ class Model(ByValue):
         facts = {"network": self.decoder.specs.size, "shapes": len(self.shapes), "named": self.shapes}
         return notebook.table(self.name, facts)
 
-    def code_of(self, shape: str) -> Float[Tensor, "length"]:
-        """Returns the code of a training shape. Raises `ValueError` for a name that the model has not."""
+    def code_of(self, shape: str | int) -> Float[Tensor, "length"]:
+        """Returns a training shape's code, by name or number. Raises `ValueError` for one that the model has not."""
+        if isinstance(shape, int):
+            if not 0 <= shape < len(self.codes):
+                raise ValueError(f"code {shape} was given; {self.name} has {len(self.codes)}, counted from 0")
+            return self.codes[shape]
         if shape not in self.shapes:
             close = get_close_matches(shape, self.shapes, cutoff=0.4)
             proposal = f"did you mean {' or '.join(close)}?" if close else "see `model.shapes`"

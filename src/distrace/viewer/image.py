@@ -1,7 +1,7 @@
 """A picture in bands of rows, so that tracing can stop between them; and the layers that are drawn from it."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 
 from distrace import shading
-from distrace.camera import Camera
 from distrace.render import Buffers
 from distrace.shading import Picture
 from distrace.tracing.sphere_tracing import Outcome
@@ -19,15 +18,6 @@ SHADED = "shaded"
 ERRORS = (-8.0, -3.0)  # powers of ten of a radius, from the darkest to the brightest colour
 Light = Float[np.ndarray, "3"] | None
 """The direction to the light; None: over the camera's left shoulder."""
-
-
-def bands(camera: Camera) -> Iterator[Camera]:
-    """Returns the cameras of an image's bands, from the top."""
-    rows = max(1, BAND // camera.width)
-    for top in range(0, camera.height, rows):
-        intrinsics = camera.intrinsics.clone()
-        intrinsics[1, 2] -= top
-        yield replace(camera, intrinsics=intrinsics, height=min(rows, camera.height - top))
 
 
 @dataclass(frozen=True)

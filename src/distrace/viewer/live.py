@@ -14,7 +14,7 @@ from distrace.camera import Camera
 from distrace.render import Buffers, render
 from distrace.shading import Picture
 from distrace.tracing.bounds import Occupancy
-from distrace.viewer.image import LAYERS, SHADED, Image, Light, bands
+from distrace.viewer.image import BAND, LAYERS, SHADED, Image, Light
 from distrace.viewer.scene import Scene
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ class TracedField:
 
     def image(self, camera: Camera) -> Image:
         """Traces a whole image."""
-        return Image([self.trace(band) for band in bands(camera)])
+        return Image([self.trace(band) for band in camera.bands(BAND)])
 
 
 @dataclass(frozen=True)
@@ -124,12 +124,13 @@ class LiveView:
     def _traced(self, shown: Shown, camera: Camera) -> Image | None:
         """Traces a picture; None where the camera or the shape moved meanwhile, unless it is the coarsest."""
         traced: list[Buffers] = []
-        for band in bands(camera):
+        for band in camera.bands(BAND):
             traced.append(shown.field.trace(band))
             if self.closed or (self.changed.is_set() and camera.height > HEIGHTS[0]):
                 return None
         return Image(traced)
 
+    @torch.no_grad()  # a depth with a gradient would evaluate the field once more
     def _send(self, shown: Shown, camera: Camera, image: Image, seconds: float) -> None:
         picture, legend = shown.picture(image)
         depth = np.nan_to_num(image.depth, posinf=FAR)
