@@ -7,6 +7,7 @@ from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spr
 from experiments.commands.foreign_models import ForeignModels
 from experiments.commands.photographs import Photographs
 from experiments.commands.placement import Placement
+from experiments.commands.placement_network import TrainPlacement
 from experiments.commands.procedural import Procedural
 from experiments.commands.real_scans import RealScans
 from experiments.commands.tables import Completion, HeldOut, Pose, Training
@@ -30,6 +31,7 @@ COMMANDS = {
     "spread": Spread,
     "pose": Pose,
     "placement": Placement,
+    "train-placement": TrainPlacement,
     "real-scans": RealScans,
     "multiview": Multiview,
     "photographs": Photographs,

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.fitting.scan_residuals import PlacedCode, ScanProblem, ScanSample, Start, extended
+from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem, ScanSample, extended
 from distrace.fitting.solver import Residuals
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -26,7 +26,16 @@ def problem(points: Tensor, rays: Rays, until: Tensor, free: int, **options: boo
     state = PlacedCode(0, prior.mean, torch.tensor([0.3, -0.2, 0.5]).double(), place)
     up = torch.tensor([0.0, 1.0, 0.0]).double()
     sample = ScanSample(points.double(), Rays(rays.origins.double(), rays.directions.double()), until.double(), free)
-    return ScanProblem(decoder, prior, sample, 0.1, [Start(1.8, up)], 0.1, 8, **options), state
+    return ScanProblem(
+        decoder,
+        prior,
+        sample,
+        0.1,
+        [Belief(1.8, torch.tensor([0.1, -0.9, 4.2]).double(), up, 0.2, 0.3)],
+        0.1,
+        8,
+        **options,
+    ), state
 
 
 def nothing() -> tuple[Rays, Tensor]:
@@ -71,7 +80,7 @@ def across(count: int) -> Rays:
 
 
 def of_rays(found: Residuals) -> Tensor:
-    return found.values[: -(3 + 1 + 3)]
+    return found.values[: -(3 + 1 + 3 + 3)]
 
 
 def test_free_rays_count_where_they_enter_the_shape_and_hits_where_they_miss_it() -> None:

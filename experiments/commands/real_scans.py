@@ -13,6 +13,7 @@ from distrace.cli.common import save_meshes, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.data.scan_files import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.fitting.placement_network import load_placement_network
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.prior import prior_of
 from distrace.processes import each_done
@@ -63,7 +64,8 @@ def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
     """Completes an input, writes its mesh, and returns its row."""
     scan = load_scan(given.paths, given.options)
     model = load_model(given.model)
-    fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed))
+    network = load_placement_network(given.model)
+    fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed), network=network)
     mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
     mesh.apply_transform(fit.place.T_world_object.double().numpy())
     folder = start(out / given.name).out

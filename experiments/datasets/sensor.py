@@ -43,8 +43,11 @@ class Scene:
     place: Similarity  # true
 
 
-def sensed(solid: Solid, seed: int, hidden: bool) -> Scene:
-    """Returns a random scene: the object on a floor before a wall, turned, tilted and sized at random."""
+def sensed(solid: Solid, seed: int, hidden: bool, reduction: int = 1) -> Scene:
+    """Returns a random scene: the object on a floor before a wall, turned, tilted and sized at random.
+
+    With a `reduction`, of every so many rows and columns of the sensor one.
+    """
     random = np.random.default_rng(seed)
     radius = random.uniform(*RADII)
     turn = random.uniform(0, 2 * math.pi)
@@ -54,7 +57,7 @@ def sensed(solid: Solid, seed: int, hidden: bool) -> Scene:
     rotation = rotation @ roma.rotvec_to_rotmat(torch.tensor([0, turn, 0]).float())
     centre = torch.from_numpy(random.uniform(-0.3, 0.3, 3)).float()
     place = Similarity(rotation, centre, torch.tensor(float(radius)))
-    camera = _camera(random, radius, centre)
+    camera = _camera(random, radius, centre, reduction)
     local = place.camera_in_object(camera)
     seen = observe(solid, local)
     depth = seen.depth * radius
@@ -74,14 +77,15 @@ def sensed(solid: Solid, seed: int, hidden: bool) -> Scene:
     return Scene(View(camera, depth), _wrong(true_mask, seed), place)
 
 
-def _camera(random: np.random.Generator, radius: float, centre: Tensor) -> Camera:
+def _camera(random: np.random.Generator, radius: float, centre: Tensor, reduction: int) -> Camera:
     azimuth = random.uniform(0, 2 * math.pi)
     elevation = math.radians(random.uniform(5, 40))
     distance = radius * random.uniform(3.0, 4.5) + 0.3
     direction = [math.sin(azimuth) * math.cos(elevation), math.sin(elevation), math.cos(azimuth) * math.cos(elevation)]
     eye = centre + distance * torch.tensor(direction).float()
     target = centre + radius * torch.from_numpy(random.uniform(-0.2, 0.2, 3)).float()
-    return Camera.look_at(eye, target, height=HEIGHT, width=WIDTH, focal_px=FOCAL)
+    size = {"height": HEIGHT // reduction, "width": WIDTH // reduction}
+    return Camera.look_at(eye, target, **size, focal_px=FOCAL / reduction)
 
 
 def _room(camera: Camera, floor: float, centre: Tensor, radius: float) -> tuple[Tensor, Tensor]:

@@ -20,6 +20,7 @@ from distrace.data.solid import Solid, normalised, normalised_frame
 from distrace.data.up import Up
 from distrace.files import save_json
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.fitting.placement_network import load_placement_network
 from distrace.mesh import extract_mesh
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
@@ -112,7 +113,8 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     scene = sensed(solid, hash_of(trial.shape) + trial.scene, trial.hidden)
     scan = scan_of_view(scene.view, scene.mask, Up.along("y"))
     known = scene.place if trial.told else None
-    fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known)
+    network = load_placement_network(place.models[trial.category])
+    fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known, network=network)
     mesh = extract_mesh(place.field_of(trial.category, fit.code), place.mesh)
     found = by_extent(mesh, fit.place)
     degrees, size, centre = placement_error(found, scene.place, symmetric_turns(place.meshes, trial))

@@ -103,6 +103,14 @@ def bundled_models() -> list[str]:
     return sorted(path.parent.name for path in BUNDLED.glob("*/specs.json"))
 
 
+def model_folder(name: str | Path) -> Path:
+    """Returns the folder of a bundled model or of any other. Raises `ValueError` where there is none."""
+    folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
+    if not folder.is_dir():
+        raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
+    return folder
+
+
 def load_model(name: str | Path) -> Model:
     """Loads a bundled model by name, or any DeepSDF experiment folder.
 
@@ -111,9 +119,7 @@ def load_model(name: str | Path) -> Model:
     >>> load_model("sofas")
     Model('sofas', 657 shapes, codes=float32[657, 256], 8 × 512)
     """
-    folder = BUNDLED / name if str(name) in bundled_models() else Path(name)
-    if not folder.is_dir():
-        raise ValueError(f"{name} is neither a folder nor a bundled model ({', '.join(bundled_models())})")
+    folder = model_folder(name)
     specs, shapes = _read_specs(folder)
     ours = folder / "model.safetensors"
     source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)

@@ -21,6 +21,7 @@ from distrace.errors import explained
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.judge import Verdict
+from distrace.fitting.placement_network import load_placement_network
 from distrace.mesh import MeshConfig
 
 if TYPE_CHECKING:
@@ -109,7 +110,9 @@ class Complete:
         scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box, self.poses))
         scan = scan if self.points is None else scan.sparse(self.points, self.seed)
         truth = None if self.reference is None else _reference(self.reference)
-        return complete_scan(run, ScanTask(opened_for(run, self.model), scan, truth, mesh, self.seed, self.formats))
+        model = opened_for(run, self.model)
+        network = load_placement_network(self.model)
+        return complete_scan(run, ScanTask(model, network, scan, truth, mesh, self.seed, self.formats))
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
         if len(self.inputs) > 1:

@@ -18,6 +18,7 @@ from distrace.data.scan import Scan
 from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
 from distrace.fitting.judge import Verdict
+from distrace.fitting.placement_network import PlacementNetwork
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
@@ -43,6 +44,7 @@ class ScanTask:
     """A scan to complete, and the settings."""
 
     model: Model
+    network: PlacementNetwork | None  # of the model
     scan: Scan
     truth: "trimesh.Trimesh | np.ndarray | None"  # in the scan's frame
     mesh: MeshConfig
@@ -91,7 +93,9 @@ def _fitted(task: ScanTask) -> ScanFit:
     scan = task.scan.to(task.mesh.device)
     console.print(f"fitting {len(scan.points):,} points and {len(scan.free_until):,} rays of free space")
     with progress("fitting", config.total) as bar:
-        return fit_scan(task.model.decoder, scan, prior, config, progress=lambda done: bar.advance(to=done))
+        return fit_scan(
+            task.model.decoder, scan, prior, config, progress=lambda done: bar.advance(to=done), network=task.network
+        )
 
 
 @torch.no_grad()

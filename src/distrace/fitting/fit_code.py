@@ -212,7 +212,7 @@ def minimised(
             prior,
             sample,
             deviation,
-            starts=(),
+            beliefs=(),
             tilt=0.0,
             samples=stage.samples,
             moves=False,

@@ -9,7 +9,7 @@ import roma
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch.nn.functional import interpolate
+from torch.nn.functional import interpolate, normalize
 
 from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
@@ -121,17 +121,6 @@ def _is_near(first: Similarity, second: Similarity) -> bool:
     return apart < LEAST_APART and abs(float((first.scale / second.scale).log())) < LEAST_GROWTH
 
 
-@torch.no_grad()
-def proposed_codes(
-    scan: Scan, place: Similarity, decoder: Decoder | BFloat16Decoder, prior: Prior, count: int, seed: int
-) -> list[PlacedCode]:
-    """Returns the best typical shapes at a known placement, best first; numbered from 0."""
-    volumes = Volumes.of(decoder, prior, seed)
-    losses = Probes.of(scan, seed).losses(volumes, place.rotation, place.scale[None], place.translation[None])[0]
-    best = losses.argsort()[:count].tolist()
-    return [PlacedCode(k, volumes.codes[shape], prior.mean[:0], place) for k, shape in enumerate(best)]
-
-
 @dataclass(frozen=True)
 class Probes:
     """Points of a scan's surface, and points of the free space about the object."""
@@ -205,9 +194,13 @@ def _rotations(ups: Float[Tensor, "k 3"]) -> Float[Tensor, "n 3 3"]:
     """Returns rotations of an object whose y axis points to one of `ups`, or anywhere where there are none."""
     if len(ups):
         return torch.cat([_turned(up) for up in ups])
+    return torch.cat([_turned(axis)[::2] for axis in axes_around()])
+
+
+def axes_around() -> Float[Tensor, "26 3"]:
+    """Returns unit vectors in all directions: to the faces, edges and corners of a cube."""
     directions = torch.cartesian_prod(*(torch.tensor([-1.0, 0.0, 1.0]),) * 3)
-    directions = directions[directions.norm(dim=-1) > 0]
-    return torch.cat([_turned(axis / axis.norm())[::2] for axis in directions])
+    return normalize(directions[directions.norm(dim=-1) > 0], dim=-1)
 
 
 def _turned(up: Float[Tensor, "3"]) -> Float[Tensor, "turns 3 3"]:

@@ -43,11 +43,14 @@ class PlacedCode:
 
 
 @dataclass(frozen=True)
-class Start:
-    """What is likely of the end of a start."""
+class Belief:
+    """Where a start is likely to end: Gaussians of its size, its centre and its own up."""
 
     size: float
+    centre: Float[Tensor, "3"]
     up: Float[Tensor, "3"] | None
+    size_deviation: float = GROWTH  # of the logarithm
+    centre_deviation: float = torch.inf  # in sizes
 
 
 @dataclass(frozen=True)
@@ -83,7 +86,7 @@ class ScanProblem:
     prior: Prior
     sample: ScanSample
     deviation: float  # in the scan's unit
-    starts: Sequence[Start]
+    beliefs: Sequence[Belief]  # of each start; none where the placement is known
     tilt: float
     samples: int  # on each ray, at which its least value is sought
     moves: bool = True  # whether the placement is unknown
@@ -186,19 +189,22 @@ class ScanProblem:
         w, place = state.w, state.place
         if not self.moves:
             return w / self.code_deviation, torch.eye(count).to(w) / self.code_deviation
-        growth = (place.scale / self.starts[state.start].size).log()[None] / GROWTH
+        belief = self.beliefs[state.start]
+        growth = (place.scale / belief.size).log()[None] / belief.size_deviation
+        unit = belief.centre_deviation * belief.size
+        shift = (place.translation - belief.centre) / unit
         tilt = w.new_zeros(0)
         by_turn = w.new_zeros(0, 3)
-        up = self.starts[state.start].up
-        if up is not None:
+        if belief.up is not None:
             axis = place.rotation[:, 1]
-            tilt = torch.linalg.cross(axis, up) / self.tilt
-            by_turn = (axis[:, None] * up[None] - (axis @ up) * torch.eye(3).to(w)) / self.tilt
-        derivatives = w.new_zeros(count + 1 + len(tilt), count + 7)
+            tilt = torch.linalg.cross(axis, belief.up) / self.tilt
+            by_turn = (axis[:, None] * belief.up[None] - (axis @ belief.up) * torch.eye(3).to(w)) / self.tilt
+        derivatives = w.new_zeros(count + 4 + len(tilt), count + 7)
         derivatives[:count, :count] = torch.eye(count) / self.code_deviation
-        derivatives[count, count + 6] = 1 / GROWTH
-        derivatives[count + 1 :, count : count + 3] = by_turn
-        return torch.cat([w / self.code_deviation, growth, tilt]), derivatives
+        derivatives[count, count + 6] = 1 / belief.size_deviation
+        derivatives[count + 1 : count + 4, count + 3 : count + 6] = torch.eye(3).to(w) * (place.scale / unit)
+        derivatives[count + 4 :, count : count + 3] = by_turn
+        return torch.cat([w / self.code_deviation, growth, shift, tilt]), derivatives
 
 
 def extended(

@@ -1,0 +1,1 @@
+"""Networks that start fits: the scans they train on, and their training."""
