@@ -9,11 +9,11 @@ import tyro
 
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
-from distrace.cli.common import save_meshes, show_table
+from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
 from distrace.data.scan_files import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.prior import prior_of
 from distrace.processes import each_done
 from experiments.commands.depth import checked
@@ -64,11 +64,10 @@ def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
     scan = load_scan(given.paths, given.options)
     model = load_model(given.model)
     fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed))
-    mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
-    mesh.apply_transform(fit.place.T_world_object.double().numpy())
+    mesh = mesh_in_world(extract_mesh(model.field(fit.code), MeshConfig(resolution)), fit.place)
     folder = start(out / given.name).out
     save_code(folder, fit.code, fit.place)
-    save_meshes(folder, mesh, ("ply",))
+    save_mesh(folder / "mesh.ply", mesh)
     verdict = fit.verdict
     return {
         "input": given.name,

@@ -26,7 +26,7 @@ from distrace.data.pictures import read_mask
 from distrace.errors import explained
 from distrace.files import save_json, written
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer, surface_points
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
 from distrace.photos.initialisation import Initialiser
@@ -110,8 +110,7 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     else:
         code, place = _fitted(trial, model, clip)
         seconds = time.perf_counter() - start
-        surface = extract_mesh(model.field(code), MeshConfig(RESOLUTION))
-        surface.apply_transform(place.T_world_object.numpy())
+        surface = mesh_in_world(extract_mesh(model.field(code), MeshConfig(RESOLUTION)), place)
     true = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
     distance = chamfer(surface, true)
     motion = remaining_motion(surface, true)

@@ -2,6 +2,7 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,8 @@ from torch import Tensor
 from distrace.errors import DoubtfulResult
 from distrace.fields.base import SDF, check_field, chunked, evaluate_checked, pruned
 from distrace.fields.lipschitz import percentile_99, typical_slope
+from distrace.files import written
+from distrace.pose import Similarity
 from distrace.surface import directions_of_taps
 
 if TYPE_CHECKING:
@@ -83,6 +86,19 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> "trimesh.Trimes
     evaluated = np.isfinite(grid)
     vertices, faces, _, _ = marching_cubes(np.where(evaluated, grid, 1.0), 0.0, mask=_whole_cells(evaluated))
     return trimesh.Trimesh(vertices * config.width - config.radius, faces, process=False)
+
+
+def mesh_in_world(mesh: "trimesh.Trimesh", place: Similarity) -> "trimesh.Trimesh":
+    """Returns a copy of a mesh of the object's frame in the world, moved in double precision."""
+    return mesh.copy().apply_transform(place.T_world_object.double().cpu().numpy())
+
+
+def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices."""
+    kind = path.suffix.removeprefix(".")
+    options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
+    with written(path) as file:
+        mesh.export(file, file_type=kind, **options)
 
 
 class _Watched:

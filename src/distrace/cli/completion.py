@@ -13,7 +13,7 @@ from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Format, chamfer_facts, save_mesh, save_meshes
+from distrace.cli.common import Format, chamfer_facts, save_meshes
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
@@ -25,7 +25,7 @@ from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFit, CodeFitConfig
 from distrace.fitting.free_space import LEFT_OUT, completed
 from distrace.fitting.judge import Verdict, judged
-from distrace.mesh import MeshConfig
+from distrace.mesh import MeshConfig, save_mesh
 from distrace.metrics import Chamfer, chamfer, iou
 from distrace.pose import Similarity
 from distrace.prior import prior_of

@@ -16,7 +16,7 @@ from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
-from distrace.mesh import MeshConfig
+from distrace.mesh import MeshConfig, mesh_in_world
 from distrace.movie import save_gif
 from distrace.pose import exp_se3
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
@@ -50,8 +50,7 @@ class Reconstructed:
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
-        mesh.vertices = self.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
-        save_meshes(run.out, mesh, formats)
+        save_meshes(run.out, mesh_in_world(mesh, self.placement.similarity), formats)
         rows = self._rows(held_out)
         refined = {view.name: self.placement.camera_to_world(view.camera) for view in self._refined}
         save_cameras(run.out / "transforms.json", refined)

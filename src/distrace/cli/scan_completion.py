@@ -18,7 +18,7 @@ from distrace.data.scan import Scan
 from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
 from distrace.fitting.judge import Verdict
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -56,8 +56,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     place = fit.place.to("cpu")
     save_code(run.out, fit.code, place)
     save_scan(run.out / "scan.npz", task.scan)
-    mesh = extract_mesh(task.model.field(fit.code), task.mesh)
-    mesh.apply_transform(place.T_world_object.double().numpy())
+    mesh = mesh_in_world(extract_mesh(task.model.field(fit.code), task.mesh), place)
     save_meshes(run.out, mesh, task.formats)
     pictures = _pictures(task, fit, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))

@@ -115,13 +115,11 @@ def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device)
         surface.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["surface"])
         sphere = content["unit_sphere"]
         unit = placement_of(sphere["centre"], sphere["radius"])
-    scale = torch.tensor(unit.radius)
-    unit_place = Similarity(torch.eye(3), unit.centre.float(), scale)
     cameras: list[Camera] = []
     if (folder / "transforms.json").is_file():
         cameras = [unit.camera_to_unit(camera) for camera in read_cameras(folder / "transforms.json")]
     field = surface.requires_grad_(False).eval().to(device)
-    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit_place, device=device)
+    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit.similarity, device=device)
 
 
 def _placement(path: Path) -> Similarity:
