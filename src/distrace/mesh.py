@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from distrace.errors import DoubtfulResult
@@ -94,11 +94,27 @@ def mesh_in_world(mesh: "trimesh.Trimesh", place: Similarity) -> "trimesh.Trimes
 
 
 def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices."""
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the sRGB colours of its vertices.
+
+    A GLB holds the same colours in linear light, as glTF 2.0 has them (section 3.7.2.1).
+    """
+    from trimesh.visual import ColorVisuals
+
     kind = path.suffix.removeprefix(".")
+    if kind == "glb" and isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
+        colours = _in_linear_light(np.asarray(mesh.visual.vertex_colors))
+        mesh = mesh.copy()
+        mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
     options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
     with written(path) as file:
         mesh.export(file, file_type=kind, **options)
+
+
+def _in_linear_light(colours: UInt8[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
+    """Returns sRGB colours in linear light (IEC 61966-2-1); the fourth column, the opacity, is linear already."""
+    srgb = colours[:, :3] / 255
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.hstack([np.rint(255 * light).astype(np.uint8), colours[:, 3:]])
 
 
 class _Watched:
