@@ -13,7 +13,7 @@ from test_scan import HEIGHT, RADIUS, on_ball, room
 from distrace.camera import Camera
 from distrace.data.observation import View
 from distrace.data.scan import Scan
-from distrace.data.scan_files import ScanOptions, load_scan
+from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.errors import DoubtfulResult
 from distrace.files import save_arrays
 from distrace.rays import meet_sphere

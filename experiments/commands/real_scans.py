@@ -11,7 +11,7 @@ from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
 from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
-from distrace.data.scan_files import ScanOptions, load_scan
+from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.prior import prior_of

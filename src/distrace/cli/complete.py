@@ -16,7 +16,7 @@ from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
-from distrace.data.scan_files import CLOUDS, ScanOptions, load_scan
+from distrace.data.scan_inputs import CLOUDS, ScanOptions, load_scan
 from distrace.errors import explained
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig

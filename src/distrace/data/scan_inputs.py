@@ -1,4 +1,4 @@
-"""Reads scans from files: depth images with cameras, observations, clouds of points; also several of one world."""
+"""Reads the files that a user gives of an object: depth images with cameras, observations, clouds of points."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,9 +11,9 @@ from torch import Tensor
 
 from distrace.data.cloud import read_points
 from distrace.data.depth_image import KINDS, load_depth_image, load_intrinsics, load_mask, load_pose
-from distrace.data.object_view import ObjectView, find_again, find_object
 from distrace.data.observation import View, read_scene
 from distrace.data.scan import Scan, joined, scan_of_object, scan_of_points
+from distrace.data.segmented_view import SegmentedView, find_object, find_object_again
 from distrace.data.up import Up
 from distrace.errors import DoubtfulResult, about
 
@@ -49,7 +49,7 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
             pose = poses.pop(0) if _kind(path) in KINDS else None
             read.append((path, *_read_image(path, pose, options)))
     scans = []
-    first: ObjectView | None = None
+    first: SegmentedView | None = None
     for path, scene, mask, up in read:
         with about(path):
             if first is None:
@@ -57,7 +57,7 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
             elif mask is not None:
                 found = find_object(scene, mask, up, isolate=False)
             else:
-                found = find_again(first, scene)
+                found = find_object_again(first, scene)
         if found is None:
             sentence = f"{path} shows hardly a point near the object of the first image, and is left out"
             warnings.warn(sentence, DoubtfulResult, stacklevel=2)
@@ -115,7 +115,7 @@ def _refuse(path: Path, whose: str, **given: object) -> None:
             raise ValueError(f"--{name} was given for {path}, and {whose} alone; leave it out")
 
 
-def _find_first(scene: View, mask: Bool[Tensor, "height width"] | None, options: ScanOptions, up: Up) -> ObjectView:
+def _find_first(scene: View, mask: Bool[Tensor, "height width"] | None, options: ScanOptions, up: Up) -> SegmentedView:
     """Returns the object that the options tell, or else the mask of the file."""
     height, width = scene.depth.shape
     if options.mask is not None:
