@@ -134,5 +134,5 @@ def test_each_depth_image_needs_a_pose(write: Write, tmp_path: Path) -> None:
     view = View(here, scene.depth)
     arrays = {"depth": view.depth, "intrinsics": here.intrinsics, "T_world_camera": here.T_world_camera}
     save_arrays(tmp_path / "view.npz", arrays)
-    with pytest.raises(ValueError, match="--poses names 2 files for 0 depth images"):
+    with pytest.raises(ValueError, match=r"--poses was given for .*view\.npz, and is a depth image's alone"):
         load_scan([tmp_path / "view.npz"], ScanOptions(poses=options.poses))

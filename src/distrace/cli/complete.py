@@ -46,8 +46,8 @@ class Complete:
     inputs: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT …", help_behavior_hint="(required)")]
     ]
-    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world:
-    depth images with --poses"""
+    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one kind:
+    depth images with --poses, observations of one world, or clouds in one frame"""
     out: Path = Path("out/complete")
     up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
     """axis of the input's frame that points up, or `unknown`"""
@@ -113,7 +113,7 @@ class Complete:
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
         if len(self.inputs) > 1:
-            raise ValueError(f"{len(self.inputs)} inputs were given; one is completed in the canonical frame")
+            raise ValueError(f"{len(self.inputs)} inputs were given; give one, or --frame input, which takes several")
         path = next(iter(self.inputs))
         cloud = path.suffix.lower() in CLOUDS
         if cloud and (self.solver == "adam" or self.ignore):
