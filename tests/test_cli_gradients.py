@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -107,11 +108,25 @@ def test_a_derivative_that_disagrees_is_status_1_and_said(
     assert "DISAGREES" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [("check-gradients",), ("bench", "gradients"), ("bench", "trace")])
+def test_a_code_is_a_number_a_name_or_a_file(command: tuple[str, ...], run: Callable[..., int], tmp_path: Path) -> None:
+    folder = tmp_path / "balls"
+    save_experiment(folder, ball(2, 16).decoder, torch.tensor([[0.0], [0.2]]), ("first", "second"))
+    np.save(tmp_path / "mine.npy", np.array([0.2], np.float32))
+    tables = []
+    for code in ("1", "second", tmp_path / "mine.npy", "0"):
+        run(*command, folder, "--code", code, "--size", "10", "--out", tmp_path / "out")
+        rows = facts(tmp_path / "out")["rows"]
+        tables.append([{key: value for key, value in row.items() if key != "seconds"} for row in rows])
+    assert tables[0] == tables[1] == tables[2] != tables[3]
+    assert run(*command, folder, "--code", "secund", "--out", tmp_path / "out") == 2
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--code 3", "code 3 was given"),
-        ("--code -1", "code -1 was given"),
+        ("--code -1", "-1 is neither the number nor the name of a training shape, nor a code.npy"),
         ("--size 0", "0 × 0"),
         ("--distance 0", "its own place"),
         ("--distance 9000 --focal-mm 1", "sees nothing"),
