@@ -78,10 +78,8 @@ class Multiview:
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
-        save_cameras(
-            run.out / "transforms.json",
-            {view.name: found.placement.camera_to_world(view.camera) for view in found.views},
-        )
+        sources = [view.source for view in found.views if view.source is not None]
+        save_cameras(run.out / "transforms.json", {source.file: source.camera for source in sources})
         run.finish(
             {
                 "loss": last.loss,

@@ -13,6 +13,7 @@ from distrace.data.checks import check_intrinsics
 from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
 from distrace.data.photo_readers.frames import Shot, inside
 from distrace.data.photograph import Photograph as Photograph
+from distrace.data.photograph import Source
 from distrace.data.pictures import read_mask, read_picture
 from distrace.data.placement import Placement as Placement
 from distrace.data.placement import among_points, between_axes
@@ -134,7 +135,7 @@ def _photograph(shot: Shot) -> Photograph:
         matrices = torch.from_numpy(shot.intrinsics), torch.from_numpy(shot.T_world_camera)
         camera = Camera.from_matrices(*matrices, height, width)
         check_intrinsics(camera)
-    return Photograph(shot.image.stem, camera, image, mask)
+    return Photograph(shot.image.stem, camera, image, mask, Source(shot.image, camera))
 
 
 def _remarks(view: Photograph) -> list[str]:

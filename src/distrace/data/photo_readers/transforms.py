@@ -1,6 +1,7 @@
 """`transforms.json`, as NeRF (Mildenhall et al., ECCV 2020), instant-ngp and nerfstudio write it."""
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -95,15 +96,16 @@ def _number(entry: dict[str, Any], name: str) -> float:
     return float(value)
 
 
-def save_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Writes the cameras of images, by the names of their files, as other tools read them."""
+def save_cameras(path: Path, cameras: Mapping[Path, Camera]) -> None:
+    """Writes the cameras of images, by their files, as nerfstudio and instant-ngp read them: paths are from `path`."""
     frames = []
-    for name, camera in cameras.items():
+    folder = path.parent.resolve()
+    for file, camera in cameras.items():
         intrinsics = camera.intrinsics.tolist()
         pose = camera.T_world_camera.cpu().double().numpy() @ OPENGL
         frames.append(
             {
-                "file_path": name,
+                "file_path": Path(os.path.relpath(file.resolve(), folder)).as_posix(),
                 "w": camera.width,
                 "h": camera.height,
                 "fl_x": intrinsics[0][0],
