@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 COMPLETED: tuple[Format, ...] = ("ply", "glb")  # always written
 CLOUD_SIZE = 256  # pixels along each side of the pictures of a cloud's completion
-SMALL = 144  # pixels along each side of the pictures of other completions
+OTHERS_SIDE = 144  # pixels along each side of the pictures of other completions
 SPREAD = 0.1  # distance between completions that is drawn in the fullest colour
 
 
@@ -163,7 +163,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
 def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]:
     """Returns two rows, from the camera and from behind: the spread of all completions, then each other one."""
     camera = task.camera.to(task.mesh.device)
-    camera = camera.resized(SMALL / camera.height)
+    camera = camera.resized(OTHERS_SIDE / camera.height)
     model = task.model
     codes = outcome.others
     rows = []
