@@ -20,10 +20,10 @@ from distrace.data.observation import View
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import canonical_scan
 from distrace.files import save_text
-from distrace.fitting.completing import complete_shape, plausible, spread
+from distrace.fitting.completing import complete_shape, posterior_codes, posterior_deviation
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFit, CodeFitConfig
-from distrace.fitting.free_space import LEFT_OUT, completed
+from distrace.fitting.free_space import PRUNED_PIECES, pruned_mesh
 from distrace.fitting.judge import Verdict, judged
 from distrace.mesh import MeshConfig, save_mesh
 from distrace.metrics import Chamfer, chamfer, iou
@@ -60,7 +60,7 @@ class Task:
         return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
 
     def surface(self, code: Float[Tensor, "length"]) -> "trimesh.Trimesh":
-        return completed(self.model.field(code), self.known, self.mesh)
+        return pruned_mesh(self.model.field(code), self.known, self.mesh)
 
     def shown(self, observation: View | Cloud) -> View:
         return observation.seen_from(self.camera) if isinstance(observation, Cloud) else observation
@@ -107,12 +107,12 @@ def _outcome(task: Task, fit: CodeFit) -> Outcome:
     evaluations = fit.evaluations
     if task.plausible:
         config = task.fit if isinstance(task.fit, CodeFitConfig) else CodeFitConfig(seed=task.fit.seed)
-        others, spent = plausible(task.model, task.known, task.plausible, config)
+        others, spent = posterior_codes(task.model, task.known, task.plausible, config)
         evaluations += spent
     mesh = task.surface(fit.code)
     if others and len(mesh.faces):
         vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
-        mesh.vertex_attributes["spread"] = spread(task.model, others, vertices).cpu().numpy()
+        mesh.vertex_attributes["spread"] = posterior_deviation(task.model, others, vertices).cpu().numpy()
     return Outcome(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
 
 
@@ -126,10 +126,11 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         camera = task.camera.to(task.mesh.device)
         before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
+    pruned = outcome.mesh.metadata.get(PRUNED_PIECES, 0)
     facts = {
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
-        "pieces removed from the mesh, where the view shows free space": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
+        "pieces removed from the mesh, where the view shows free space": str(pruned),
         "iterations": str(task.fit.total),
         "starts": str(task.fit.starts),
         "evaluations of the network": f"{outcome.evaluations:,}",
@@ -170,7 +171,7 @@ def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]
     for eye in (camera, camera.turned(180.0)):
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
-        distance[buffers.mask] = spread(model, codes, buffers.points)
+        distance[buffers.mask] = posterior_deviation(model, codes, buffers.points)
         pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows

@@ -48,7 +48,7 @@ def starts_section(losses: Mapping[str, Sequence[float]], chosen: str | None) ->
     return section("Loss", paragraph(about), drawn)
 
 
-def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
+def plot_history(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
     """Writes a PNG of values, one for `every` steps each, on logarithmic axes."""
     chart, axes = blank_chart("both")
     axes.plot(range(every, every * len(values) + 1, every), values, color=PALETTE[0])

@@ -11,7 +11,7 @@ from distrace.errors import explained
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import written
 from distrace.training.config import TrainConfig
-from distrace.training.losses import COURSE
+from distrace.training.losses import STEPS_PER_LOSS
 from distrace.training.trainer import Training, start
 
 NAME = "checkpoint.pt"
@@ -50,7 +50,7 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
         training.step = operator.index(state["step"])
-        unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
+        unknown = [math.nan] * -(-training.step // STEPS_PER_LOSS)  # of runs begun before losses were kept
         training.losses = [float(loss) for loss in state.get("losses", unknown)]
     if state["names"] != names:
         raise ValueError(

@@ -18,7 +18,7 @@ SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True)
-class Shot:
+class Frame:
     """One view: files and a camera in OpenCV's axes, in the folder's world and in pixels with centres at +0.5."""
 
     field: str  # file and field that say so, for errors
@@ -30,11 +30,11 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Shots:
+class Frames:
     """All views, and where the folder has them the unit sphere's placement and points of the scene."""
 
     layout: str
-    views: tuple[Shot, ...]
+    views: tuple[Frame, ...]
     placement: Placement | None = None
     points: Float[np.ndarray, "points 3"] | None = None
 
