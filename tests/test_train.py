@@ -24,7 +24,7 @@ from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
 from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import NetworkSpecs
-from distrace.files import alone
+from distrace.files import run_lock
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import NAME, load_training, save_training
@@ -514,7 +514,7 @@ def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytes
 def test_a_folder_that_another_run_is_writing_is_left_to_it(tmp_path: Path, run, capsys) -> None:
     samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
     out.mkdir()
-    with alone(out), pytest.raises(SystemExit):
+    with run_lock(out), pytest.raises(SystemExit):
         run("train", samples, "--out", out, *TINY)
     assert f"another run is writing {out}; wait for its end, or give another --out" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == [".lock"]

@@ -15,7 +15,7 @@ from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.prior import prior_of
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.commands.depth import checked
 
 CHAIR = (360, 120, 570, 480)  # left, top, right, bottom of the chair in the depth image of the first frame
@@ -50,7 +50,7 @@ class RealScans:
         work = partial(completed, run.out, self.resolution, self.seed)
         rows = []
         with progress("real scans", len(given)) as bar:
-            for row in map(work, given) if self.jobs == 1 else each_done(work, given, self.jobs):
+            for row in map(work, given) if self.jobs == 1 else parallel_map(work, given, self.jobs):
                 rows.append(row)
                 bar.advance(f"{row['input']}: {row['verdict']}")
         names = [each.name for each in given]

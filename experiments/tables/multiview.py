@@ -23,8 +23,8 @@ from distrace.checkpoints.model import Model
 from distrace.data.observation import View
 from distrace.data.photographs import Photograph, load_photographs
 from distrace.data.pictures import read_mask
-from distrace.errors import explained
-from distrace.files import save_json, written
+from distrace.errors import error_context
+from distrace.files import atomic_write, save_json
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
 from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer, surface_points
@@ -116,7 +116,7 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     motion = remaining_motion(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
     result = ClipResult(*names, distance.to, distance.from_, seconds, *motion, [round(x, 6) for x in code.tolist()])
-    with written(trial.file(".ply")) as file:
+    with atomic_write(trial.file(".ply")) as file:
         (trimesh.PointCloud(surface) if isinstance(surface, np.ndarray) else surface).export(file, file_type="ply")
     save_json(trial.file(".json"), {"made_by": mark, **asdict(result)})
     return result
@@ -145,7 +145,7 @@ def remaining_motion(surface: Surface, true: trimesh.Trimesh) -> tuple[float, fl
 def described(folder: Path) -> dict[str, Any]:
     """Returns `clip.json`. Raises `ValueError` for a folder without one."""
     path = folder / "clip.json"
-    with explained(f"{path} is no description of a clip; `python -m experiments clip SHAPE` makes one"):
+    with error_context(f"{path} is no description of a clip; `python -m experiments clip SHAPE` makes one"):
         return dict(json.loads(path.read_text(encoding="utf-8")))
 
 

@@ -16,7 +16,7 @@ from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.free_space import pruned_mesh
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.datasets.solids import observe
 from experiments.tables.sparse_depth import camera_of, true_solid
 from experiments.tables.trials import hash_of, opened_once
@@ -41,7 +41,7 @@ class SpreadRow:
 
 def spread_rows(category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
     """Yields a row for each shape."""
-    return each_done(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
+    return parallel_map(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:

@@ -17,7 +17,7 @@ from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
 from distrace.data.scan_inputs import CLOUDS, ScanOptions, load_scan
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.judge import Verdict
@@ -161,7 +161,7 @@ class Demo:
 def _reference(path: Path) -> "trimesh.Trimesh | np.ndarray":
     import trimesh
 
-    with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
+    with error_context(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
         loaded: Any = load_geometry(path)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()

@@ -67,7 +67,7 @@ class Task:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CompletionResult:
     """The result of a fit, and of the fits of other completions."""
 
     fit: CodeFit
@@ -101,7 +101,7 @@ def complete(run: Run, task: Task) -> Verdict:
     return content.verdict
 
 
-def _outcome(task: Task, fit: CodeFit) -> Outcome:
+def _outcome(task: Task, fit: CodeFit) -> CompletionResult:
     """Returns the surface and the other completions. Raises `ValueError` for a field without a zero."""
     others: list[Tensor] = []
     evaluations = fit.evaluations
@@ -113,10 +113,10 @@ def _outcome(task: Task, fit: CodeFit) -> Outcome:
     if others and len(mesh.faces):
         vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
         mesh.vertex_attributes["spread"] = posterior_deviation(task.model, others, vertices).cpu().numpy()
-    return Outcome(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
+    return CompletionResult(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
 
 
-def _page_content(task: Task, outcome: Outcome) -> report.Completion:
+def _page_content(task: Task, outcome: CompletionResult) -> report.Completion:
     """Returns everything that the page shows."""
     known = task.shown(task.known)
     full = task.shown(task.full)
@@ -161,7 +161,7 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
 
 
 @torch.no_grad()
-def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]:
+def _other_pictures(task: Task, outcome: CompletionResult) -> list[list[shading.Picture]]:
     """Returns two rows, from the camera and from behind: the spread of all completions, then each other one."""
     camera = task.camera.to(task.mesh.device)
     camera = camera.resized(OTHERS_SIDE / camera.height)

@@ -15,7 +15,7 @@ from distrace.cli.common import NONE, Every, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
-from distrace.files import alone
+from distrace.files import run_lock
 from distrace.render import render
 from distrace.report.charts import plot_history
 from distrace.report.completion_page import View
@@ -74,7 +74,7 @@ class Train:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
         run = start(self.out, self.device)
-        with alone(run.out), flushed_denormals(), run.noticing():
+        with run_lock(run.out), flushed_denormals(), run.noticing():
             self._train(run, saving)
 
     def _train(self, run: Run, saving: Every) -> None:

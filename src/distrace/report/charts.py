@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.optional import require
 from distrace.report.page import Html, paragraph, section
 
@@ -53,7 +53,7 @@ def plot_history(path: Path, values: Sequence[float], every: int, x_label: str, 
     chart, axes = blank_chart("both")
     axes.plot(range(every, every * len(values) + 1, every), values, color=PALETTE[0])
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
-    with written(path) as file:
+    with atomic_write(path) as file:
         chart.savefig(file, format="png", dpi=110, facecolor="white")
 
 

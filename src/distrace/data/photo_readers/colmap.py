@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from distrace.data.photo_readers.colmap_files import check_whole, with_point_lines
 from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, inside
-from distrace.errors import DoubtfulResult, about, explained
+from distrace.errors import DoubtfulResult, about, error_context
 from distrace.optional import require
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
@@ -55,7 +55,7 @@ def _reconstruction(model: Path) -> Any:
 
     check_whole(model)
 
-    with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
+    with error_context(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
         images = None if (model / "cameras.bin").is_file() else with_point_lines(model / "images.txt")
         if images is None:
             return Reconstruction(model)

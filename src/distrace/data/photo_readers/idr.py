@@ -7,7 +7,7 @@ import torch
 
 from distrace.data.photo_readers.frames import Frame, Frames, images_in, matrix
 from distrace.data.placement import Placement
-from distrace.errors import about, explained
+from distrace.errors import about, error_context
 
 NAME = "cameras_sphere.npz"
 TOLERANCE = 1e-5  # of the radius, between the scales of views and of axes
@@ -34,7 +34,10 @@ def read(folder: Path) -> Frames | None:
 
 
 def _matrices(path: Path) -> dict[str, np.ndarray]:
-    with explained(f"{path} cannot be read as an .npz of matrices", path), np.load(path, allow_pickle=False) as archive:
+    with (
+        error_context(f"{path} cannot be read as an .npz of matrices", path),
+        np.load(path, allow_pickle=False) as archive,
+    ):
         return {name: archive[name] for name in archive.files if name.startswith(("world_mat_", "scale_mat_"))}
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from distrace.data.photo_readers.frames import Frame, Frames, file_of
-from distrace.errors import about, explained
+from distrace.errors import about, error_context
 
 NUMBERS = 21  # of a line: intrinsics, rotation, translation
 CENTRE = 0.5  # pixels with whole numbers are middles of pixels there, as in the tools that calibrate, and corners here
@@ -19,7 +19,7 @@ def read(folder: Path) -> Frames | None:
     if len(paths) > 1:
         raise ValueError(f"{folder} holds {', '.join(path.name for path in paths)}; keep one of them")
     path = paths[0]
-    with explained(f"{path} does not begin with the number of its images"):
+    with error_context(f"{path} does not begin with the number of its images"):
         first, *lines = path.read_text(encoding="utf-8").split("\n")
         count = int(first)
     rows = [(k, words) for k, line in enumerate(lines, 2) if (words := line.split())]
@@ -31,7 +31,7 @@ def read(folder: Path) -> Frames | None:
 def _frame(folder: Path, words: list[str], field: str) -> Frame:
     with about(field):
         image = file_of(folder, {"imgname": words[0]}, "imgname")
-        with explained(f"{words[0]} is followed by {len(words) - 1} words; {NUMBERS} numbers are needed: K, R, t"):
+        with error_context(f"{words[0]} is followed by {len(words) - 1} words; {NUMBERS} numbers are needed: K, R, t"):
             numbers = np.array(words[1:], np.float64)
             intrinsics, rotation, shift = np.split(numbers.reshape(NUMBERS), (9, 18))
         intrinsics = intrinsics.reshape(3, 3)
