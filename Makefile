@@ -13,8 +13,8 @@ test-slow: .venv/installed  ## those that take seven seconds or more
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 check: .venv/installed  ## style and types
-	$(BIN)/ruff check src experiments tests examples
-	$(BIN)/ruff format --check src experiments tests examples
+	$(BIN)/ruff check src experiments tests examples docs/site
+	$(BIN)/ruff format --check src experiments tests examples docs/site
 	$(BIN)/pyright
 
 docs: .venv/installed  ## the documentation, which opens as out/docs/index.html

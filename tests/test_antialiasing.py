@@ -3,26 +3,15 @@
 import numpy as np
 import pytest
 import torch
+from seen_ball import BALL, camera_and_buffers
 
 from distrace import antialiasing
 from distrace.antialiasing import Style, smooth_outline
 from distrace.camera import Camera
-from distrace.fields.primitives import sphere
 from distrace.render import Buffers, render
 from distrace.shading import shaded_picture
 
-BALL = sphere(0.7)
-
-
-@pytest.fixture(scope="module")
-def camera() -> Camera:
-    return Camera.orbit(30, 20, 4.0, height=24, width=20)
-
-
-@pytest.fixture(scope="module")
-def seen(camera: Camera) -> Buffers:
-    with torch.no_grad():
-        return render(BALL, camera)
+camera, seen = camera_and_buffers(24, 20)
 
 
 def test_the_covered_share_is_that_of_the_disc(camera: Camera, seen: Buffers) -> None:

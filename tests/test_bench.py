@@ -122,7 +122,7 @@ def test_queries_are_all_that_the_field_was_asked_for() -> None:
 
 def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() -> None:
     spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 0.0, 0.0, 0.0]]), ("ball",))
-    rows = {row.strategy: row for row, _ in measure(of_model(spheres, 0, poster_view(48)), repeats=1)}
+    rows = {row.strategy: row for row, _ in measure(of_model(spheres, spheres.codes[0], poster_view(48)), repeats=1)}
     assert len(rows) == COUNT
     entering = int(meet_sphere(poster_view(48).rays()).meets.sum())
     assert rows["original"].queries == rows["coarse_to_fine"].queries + entering

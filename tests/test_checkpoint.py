@@ -19,7 +19,7 @@ from test_decoder import arrays, deepsdf, randomised
 from distrace.checkpoints.model import Model, bundled_models, load_model, save_experiment, save_model
 from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.prior import prior_of
 
 torch.set_num_threads(1)
@@ -570,7 +570,7 @@ def test_saving_leaves_no_parts_behind(tmp_path):
 
 
 def half_written(path: Path) -> None:
-    with written(path) as file:
+    with atomic_write(path) as file:
         file.write(b"half")
         raise OSError("disk full")
 
@@ -583,7 +583,7 @@ def test_a_file_whose_writing_fails_stays_as_it_was(tmp_path):
         with pytest.raises(OSError, match="disk full"):
             half_written(path)
         assert files(tmp_path) == ({"new/file": b"old"} if expected else {})
-    with written(path) as file:
+    with atomic_write(path) as file:
         file.write(b"whole")
         assert path.read_bytes() == b"old"
     assert files(tmp_path) == {"new/file": b"whole"}

@@ -23,7 +23,6 @@ import distrace.movie
 from distrace.camera import Camera
 from distrace.checkpoints.model import load_model, save_experiment
 from distrace.cli import COMMANDS, parsed, show
-from distrace.cli.common import save_mesh
 from distrace.cli.console import progress
 from distrace.data.observation import View, load_view, read_view, save_view
 from distrace.data.samples import write_samples
@@ -275,18 +274,6 @@ def test_mesh_writes_each_format_that_was_given_and_no_other(model: Path, run: C
         mesh = trimesh.load(tmp_path / name, process=False, force="mesh")
         assert len(mesh.faces) == faces
         assert np.linalg.norm(mesh.vertices, axis=1).mean() == pytest.approx(RADII[0], abs=0.04)
-
-
-@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
-def test_a_mesh_is_one_file_that_keeps_the_colours_of_its_vertices(kind: str, tmp_path: Path) -> None:
-    ball = trimesh.creation.icosphere(subdivisions=2)
-    ball.visual.vertex_colors = np.rint(127.5 * (ball.vertices + 1)).astype(np.uint8)
-    save_mesh(tmp_path / f"mesh.{kind}", ball)
-    assert names(tmp_path) == {f"mesh.{kind}"}
-    read = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
-    assert read.vertices == pytest.approx(ball.vertices, abs=1e-6)
-    assert (read.faces == ball.faces).all()
-    assert (read.visual.vertex_colors[:, :3] == ball.visual.vertex_colors[:, :3]).all()
 
 
 def test_complete_writes_a_mesh_a_code_and_a_page(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
@@ -610,6 +597,9 @@ BAD = [
     ("complete {model} {view} --poses {tmp}/text", "--poses was given, which --frame canonical does not use"),
     ("complete {model} {tmp}/a.png {tmp}/b.png --intrinsics 9,9,4,4", "2 depth images were given without --poses"),
     ("complete {model} {tmp}/a.png {tmp}/b.png --poses {tmp}/text --intrinsics 9,9,4,4", "--poses names 1 files"),
+    ("complete {model} {tmp}/a.png {tmp}/b.ply --intrinsics 9,9,4,4", "b.ply (a cloud) were given together"),
+    ("complete {model} {tmp}/a.npz {tmp}/b.ply", "observations of one world, or clouds in one frame"),
+    ("complete {model} {view} {view}", "2 inputs were given; give one, or --frame input"),
     ("complete {model} {view} --seed -1", "--seed -1 was given; a number from 0"),
     ("complete {model} {silhouette} --ignore mask", "silhouette.npz: without its mask it shows nothing"),
     ("complete {model} {view} --reference {tmp}/nan.ply", "nan.ply is no mesh and no cloud of points"),

@@ -6,13 +6,16 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import distrace.cli
 import distrace.cli.gradients
+from distrace.benchmarks import ablation
 from distrace.checking.gradcheck import GradientCheck, GradientRow, check_gradients
 from distrace.checkpoints.model import save_experiment
+from distrace.fields.base import SDF
 from experiments.fields.untrained import ball
 
 VIEW = ("--distance", "3", "--focal-mm", "40", "--size", "10")
@@ -107,11 +110,36 @@ def test_a_derivative_that_disagrees_is_status_1_and_said(
     assert "DISAGREES" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("command", [("check-gradients",), ("bench", "gradients"), ("bench", "trace")])
+@pytest.mark.parametrize("given", ["1", "second", "mine.npy"])
+def test_a_code_is_a_number_a_name_or_a_file(
+    given: str, command: tuple[str, ...], run: Callable[..., int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    decoder = ball(2, 16).decoder
+    save_experiment(tmp_path / "balls", decoder, torch.tensor([[0.0], [0.2]]), ("first", "second"))
+    np.save(tmp_path / "mine.npy", np.array([0.2], np.float32))
+    point = torch.tensor([[0.3, 0.4, 0.5]])
+    values = []
+
+    def measure_point(sdf: SDF, *_: object) -> None:
+        values.append(sdf(point))
+        raise ValueError("one point is enough")
+
+    monkeypatch.setattr("distrace.cli.gradients.check_gradients", lambda sdf, camera, size: measure_point(sdf))
+    monkeypatch.setattr("distrace.cli.bench.check_gradients", measure_point)
+    monkeypatch.setattr(ablation, "of_model", lambda model, code, camera: measure_point(model.field(code)))
+    code = tmp_path / given if given.endswith(".npy") else given
+    assert run(*command, tmp_path / "balls", "--code", code, "--out", tmp_path / "out") == 2
+    assert len(values) == 1
+    torch.testing.assert_close(values[0], decoder.field(torch.tensor([0.2]))(point))
+    assert not torch.allclose(values[0], decoder.field(torch.tensor([0.0]))(point))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
         ("--code 3", "code 3 was given"),
-        ("--code -1", "code -1 was given"),
+        ("--code -1", "-1 is neither the number nor the name of a training shape, nor a code.npy"),
         ("--size 0", "0 × 0"),
         ("--distance 0", "its own place"),
         ("--distance 9000 --focal-mm 1", "sees nothing"),

@@ -23,6 +23,6 @@ def losses(config: TrainConfig) -> list[float]:
 def test_recorded_steps_are_those_that_were_recorded(bfloat16: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     config = replace(CONFIG, bfloat16=bfloat16, warm_up=1)
     recorded = losses(config)
-    monkeypatch.setattr(training, "Recorded", lambda step: step)
+    monkeypatch.setattr(training, "GraphedStep", lambda step: step)
     assert recorded == losses(config)
     assert recorded[-1] < recorded[0]

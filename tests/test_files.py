@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from distrace.files import save_text, written
+from distrace.files import atomic_write, save_text
 
 
 def dead_process() -> int:
@@ -19,7 +19,7 @@ def dead_process() -> int:
 def test_an_unfinished_file_leaves_the_one_that_was_there(tmp_path: Path) -> None:
     path = tmp_path / "a"
     save_text(path, "whole")
-    with pytest.raises(ZeroDivisionError), written(path) as file:
+    with pytest.raises(ZeroDivisionError), atomic_write(path) as file:
         file.write(bytes(1 // 0))
     assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [("a", "whole")]
 

@@ -14,7 +14,7 @@ from distrace.fields import primitives
 from distrace.fields.base import SDF
 from distrace.fitting.alignment import Accuracy, Still, residuals
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
-from distrace.fitting.visibility import Sight, outline_of, rays_of
+from distrace.fitting.visibility import ObservedRays, outline_of, rays_of
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render, render_rays
 from distrace.tracing.sphere_tracing import DYNAMIC
@@ -114,7 +114,7 @@ def test_jacobians_are_the_derivatives_of_residuals(kind: str, unknown: int) -> 
     assert close.float().mean() > 0.8  # a hit is found to 3e-4, and the least value not sought on a ray that misses
 
 
-def _rays(kind: str, observed: View) -> Sight:
+def _rays(kind: str, observed: View) -> ObservedRays:
     """Twenty rays or so of which all residuals are of one kind."""
     assert observed.mask is not None
     centres = observed.camera.pixels()
@@ -128,10 +128,10 @@ def _rays(kind: str, observed: View) -> Sight:
     return sight if kind == "normal" else replace(sight, depth=_rendered(sight, observed))
 
 
-def _rendered(sight: Sight, observed: View) -> Tensor:
+def _rendered(rays: ObservedRays, observed: View) -> Tensor:
     """The depths that the start shows: where a residual is zero, what its slope does to it is, too."""
     with torch.no_grad():
-        depth = render_rays(BALL, turned(observed.camera, 3), sight.pixels, config=DYNAMIC).depth
+        depth = render_rays(BALL, turned(observed.camera, 3), rays.pixels, config=DYNAMIC).depth
     return depth
 
 

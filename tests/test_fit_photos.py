@@ -245,6 +245,20 @@ def test_a_view_with_a_wrong_camera_is_an_outlier(decoder: Decoder, views: list[
     assert not any(view.is_outlier for view in same)
 
 
+def test_masks_label_pixels_without_segmentation_and_carving(decoder: Decoder, views: list[Photograph]) -> None:
+    masks = [meet_sphere(view.camera.rays(), 0.4).meets for view in views]
+    masked = [replace(view, mask=mask) for view, mask in zip(views, masks, strict=True)]
+    photos = PhotoSet(decoder, masked, PRIOR, COMPARED)
+    labels = photos.labels(photos.sample(MEAN, 600, torch.Generator().manual_seed(0)))
+    assert all(label.equal(2.0 * mask - 1) for label, mask in zip(labels, masks, strict=True))
+    assert all(found.equal(mask) for found, mask in zip(photos.object_masks(), masks, strict=True))
+    assert "appearances" not in vars(photos), "what the segmentation needs"
+    mixed = PhotoSet(decoder, [masked[0], *views[1:]], PRIOR, COMPARED)
+    labels = mixed.labels(mixed.sample(MEAN, 600, torch.Generator().manual_seed(0)))
+    assert labels[0].equal(2.0 * masks[0] - 1)
+    assert not labels[1].equal(2.0 * masks[1] - 1)
+
+
 def test_one_photograph_is_too_few(decoder: Decoder, views: list[Photograph]) -> None:
     with pytest.raises(ValueError, match="1 photographs were given"):
         fit_photos(decoder, views[:1], PRIOR)

@@ -11,7 +11,7 @@ from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.data.solid import Solid
 from distrace.fields.base import SDF
-from distrace.fitting.free_space import LEFT_OUT, MARGIN, completed, consistent, free_space
+from distrace.fitting.free_space import MARGIN, PRUNED_PIECES, free_space, prune_pieces, pruned_mesh
 from distrace.mesh import MeshConfig
 from experiments.datasets.solids import observe
 
@@ -48,24 +48,24 @@ def test_what_is_seen_to_be_free_loses_its_piece(
     view: View, centre: tuple[float, float, float], known: tuple[str, ...], left: int
 ) -> None:
     mesh = trimesh.util.concatenate([ball(0.5), ball(0.08, centre)])
-    found = consistent(mesh, view.without(*known))
-    assert pieces(found) == left == 2 - found.metadata.get(LEFT_OUT, 0)
+    found = prune_pieces(mesh, view.without(*known))
+    assert pieces(found) == left == 2 - found.metadata.get(PRUNED_PIECES, 0)
     assert found.area == pytest.approx(ball(0.5).area + (left - 1) * ball(0.08).area)
 
 
 def test_a_piece_within_the_margin_stays(view: View) -> None:
     beside = (0.5 + 0.01 + 0.002, 0.0, 0.0)
     mesh = trimesh.util.concatenate([ball(0.5), ball(0.01, beside)])
-    assert pieces(consistent(mesh, view)) == 2
+    assert pieces(prune_pieces(mesh, view)) == 2
     further = (0.5 + 0.01 + 2 * MARGIN, 0.0, 0.0)
-    assert pieces(consistent(trimesh.util.concatenate([ball(0.5), ball(0.01, further)]), view)) == 1
+    assert pieces(prune_pieces(trimesh.util.concatenate([ball(0.5), ball(0.01, further)]), view)) == 1
 
 
 def test_what_is_connected_stays_and_so_does_the_largest_piece(view: View) -> None:
     arm = trimesh.boolean.union([ball(0.5), ball(0.3, (0.6, 0.0, 0.0))])
-    assert consistent(arm, view) is arm
+    assert prune_pieces(arm, view) is arm
     alone = trimesh.util.concatenate([ball(0.3, BESIDE), ball(0.2, (-0.75, 0.0, 0.0))])
-    assert consistent(alone, view).area == pytest.approx(ball(0.3).area)
+    assert prune_pieces(alone, view).area == pytest.approx(ball(0.3).area)
 
 
 def test_nothing_is_known_outside_of_the_image_and_behind_the_camera(view: View) -> None:
@@ -75,7 +75,7 @@ def test_nothing_is_known_outside_of_the_image_and_behind_the_camera(view: View)
 
 def test_sparse_depths_tell_only_where_they_are(view: View) -> None:
     mesh = trimesh.util.concatenate([ball(0.5), ball(0.08, BEFORE)])
-    assert pieces(consistent(mesh, view.sparse(20))) == 2
+    assert pieces(prune_pieces(mesh, view.sparse(20))) == 2
 
 
 def test_of_a_field_the_same(view: View) -> None:
@@ -85,6 +85,6 @@ def test_of_a_field_the_same(view: View) -> None:
 
     field: SDF = balls
     config = MeshConfig(64)
-    assert pieces(completed(field, view, config)) == 1
-    assert pieces(completed(field, replace(view, mask=None), config)) == 2
-    assert pieces(completed(field, Cloud(view.points()), config)) == 2
+    assert pieces(pruned_mesh(field, view, config)) == 1
+    assert pieces(pruned_mesh(field, replace(view, mask=None), config)) == 2
+    assert pieces(pruned_mesh(field, Cloud(view.points()), config)) == 2

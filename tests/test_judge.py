@@ -9,7 +9,7 @@ from torch import Tensor
 from distrace.data.scan import Scan, scan_of_points
 from distrace.data.up import Up
 from distrace.fields import primitives
-from distrace.fitting.judge import disagreement_of, judged, surface_points
+from distrace.fitting.judge import disagreement_of, judged, points_on_zero_set
 from distrace.pose import Similarity
 from distrace.rays import Rays
 
@@ -69,7 +69,7 @@ def test_a_field_that_is_nowhere_negative_explains_nothing() -> None:
 
 
 def test_another_fit_elsewhere_makes_it_doubtful() -> None:
-    surface = PLACE.to_world(surface_points(SPHERE, 300, torch.empty(0)))
+    surface = PLACE.to_world(points_on_zero_set(SPHERE, 300, torch.empty(0)))
     assert len(surface) > 250
     assert disagreement_of(surface, PLACE, []) == 0
     assert disagreement_of(surface, PLACE, [(SPHERE, PLACE)]) < 1e-2

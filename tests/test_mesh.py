@@ -2,16 +2,19 @@
 
 import math
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import trimesh
 from skimage.measure import marching_cubes
 
 from distrace.errors import DoubtfulResult
 from distrace.fields import primitives
 from distrace.fields.base import SDF
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
+from distrace.pose import Similarity
 
 COARSE = MeshConfig(resolution=48)
 BALL, PLATE = primitives.sphere(0.6), primitives.box(torch.tensor([0.6, 0.05, 0.5]))
@@ -161,3 +164,35 @@ def test_other_fields_are_not_warned_of(sdf: SDF) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         extract_mesh(sdf, COARSE)
+
+
+def test_a_mesh_moves_as_its_object_does_to_the_last_digit_of_a_double() -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    turn = torch.tensor([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]]).double()
+    place = Similarity(turn, torch.tensor([4e6, 5.0, -7.0]).double(), torch.tensor(0.25).double())
+    moved = mesh_in_world(ball, place)
+    assert np.abs(moved.vertices - place.to_world(torch.tensor(ball.vertices)).numpy()).max() < 1e-8
+    assert (moved.faces == ball.faces).all()
+    assert np.abs(ball.vertices).max() <= 1, "the mesh itself stays"
+
+
+@pytest.mark.parametrize("kind", ["ply", "glb", "obj"])
+def test_a_mesh_is_one_file_that_keeps_the_colours_of_its_vertices(kind: str, tmp_path: Path) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.visual.vertex_colors = np.rint(127.5 * (ball.vertices + 1)).astype(np.uint8)
+    save_mesh(tmp_path / f"mesh.{kind}", ball)
+    assert [path.name for path in tmp_path.iterdir()] == [f"mesh.{kind}"]
+    read = trimesh.load(tmp_path / f"mesh.{kind}", process=False, force="mesh")
+    assert read.vertices == pytest.approx(ball.vertices, abs=1e-6)
+    assert (read.faces == ball.faces).all()
+    stored = ball.visual.vertex_colors[:, :3]
+    if kind == "glb":
+        stored = np.rint(255 * linear_light(stored / 255))
+    assert (read.visual.vertex_colors[:, :3] == stored).all()
+
+
+def linear_light(srgb: np.ndarray) -> np.ndarray:
+    """Returns light from 0 to 1 by a table of the encoding, read backwards."""
+    light = np.linspace(0, 1, 100_001)
+    encoded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.interp(srgb, encoded, light)

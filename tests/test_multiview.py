@@ -58,6 +58,10 @@ def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(
     assert result["unit_sphere"] == {"centre": [3.0, 0.0, 0.0], "radius": 2.0}
     assert np.allclose(result["T_unit_object"], np.eye(4))
     assert np.load(out / "code.npy").shape == (4,)
+    taken = json.loads((tmp_path / "views" / "views.json").read_text())["views"]
+    for frame, view in zip(json.loads((out / "transforms.json").read_text())["frames"], taken, strict=True):
+        assert (out / frame["file_path"]).resolve() == (tmp_path / "views" / view["image"]).resolve()
+        assert np.array_equal(frame["transform_matrix"], np.array(view["T_world_camera"]) @ np.diag([1, -1, -1, 1]))
     for name in ("mesh.ply", "mesh.glb"):
         mesh = trimesh.load(out / name, force="mesh")
         assert mesh.centroid == pytest.approx([3.0, 0, 0], abs=0.8)

@@ -15,7 +15,7 @@ from distrace.data.photo_readers import colmap
 from distrace.data.solid import first_met, outer_surface
 from distrace.movie import save_mp4
 from distrace.optional import EXTRAS, MissingLibrary, require
-from distrace.report.charts import curves, save_course
+from distrace.report.charts import curves, plot_history
 from distrace.report.scene import scene
 
 BALL = trimesh.creation.icosphere(1)
@@ -34,7 +34,7 @@ USES: list[tuple[str, Callable[[Path], object]]] = [
     ("av", lambda folder: save_mp4(folder / "a.mp4", PICTURES)),
     ("plotly", lambda folder: scene({}, {})),
     ("matplotlib", lambda folder: curves({}, "x", "y", False)),
-    ("matplotlib", lambda folder: save_course(folder / "a.png", [1.0], 1, "x", "y")),
+    ("matplotlib", lambda folder: plot_history(folder / "a.png", [1.0], 1, "x", "y")),
 ]
 
 

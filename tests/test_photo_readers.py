@@ -26,6 +26,7 @@ from PIL import Image
 
 from distrace.camera import Camera
 from distrace.data.photo_readers.idr import decomposed
+from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photographs import load_photographs, notes
 from distrace.errors import DoubtfulResult
 
@@ -69,6 +70,19 @@ def angled(k: int) -> Camera:
 
 def test_transforms_with_intrinsics_for_each_frame_are_read(tmp_path: Path) -> None:
     reads_back(frames(tmp_path), "transforms.json")
+
+
+def test_cameras_are_saved_by_paths_of_existing_files_and_to_the_last_digit(tmp_path: Path) -> None:
+    given = frames(tmp_path / "photographs")
+    sources = [view.source for view in load_photographs(given).views if view.source is not None]
+    saved = tmp_path / "out" / "cameras" / "transforms.json"
+    save_cameras(saved, {source.file: source.camera for source in sources})
+    before = json.loads((given / "transforms.json").read_text())["frames"]
+    after = json.loads(saved.read_text())["frames"]
+    assert [entry["file_path"] for entry in after] == [f"../../photographs/images/view{k}.png" for k in range(4)]
+    for entry, old in zip(after, before, strict=True):
+        assert (saved.parent / entry["file_path"]).is_file()
+        assert entry == {**old, "file_path": entry["file_path"]}
 
 
 def test_terms_and_flags_that_say_nothing_are_no_obstacle(tmp_path: Path) -> None:

@@ -25,6 +25,7 @@ from photographed import (
 from PIL import Image
 
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes, save_photographs
+from distrace.data.placement import Placement
 from distrace.rays import meet_sphere
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"  # beside the repository, where there is one
@@ -185,7 +186,7 @@ def test_views_that_look_wrong_are_noted() -> None:
     grey = replace(first, image=torch.full_like(first.image, 0.4))
     white = replace(second, image=torch.where(torch.rand(*SIZES[1], 1) < 0.05, second.image, 1.0))
     empty = replace(third, mask=torch.zeros_like(ball(third.camera)))
-    inside = replace(fourth, camera=fourth.camera.scaled(0.1))
+    inside = replace(fourth, camera=Placement(torch.zeros(3).double(), 10.0).camera_to_unit(fourth.camera))
     assert notes(Photographs((first, second, third, fourth), WORLD, "")) == []
     found = notes(Photographs((grey, white, empty, inside), WORLD, ""))
     words = ("view0 is of one colour", "view1 is fully white", "view2 has a mask that marks no", "view3 was taken from")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 
 
 def begun(folder: Path, number: int) -> int:
@@ -36,7 +36,7 @@ def waited_for(path: Path) -> None:
 
 
 def test_results_come_as_they_are_done_and_what_is_left_ends_with_the_caller(tmp_path: Path) -> None:
-    results = each_done(partial(begun, tmp_path), [300, 0], jobs=2)
+    results = parallel_map(partial(begun, tmp_path), [300, 0], jobs=2)
     assert next(results) == 0
     waited_for(tmp_path / "300")
     began, process = time.monotonic(), int((tmp_path / "300").read_text())
@@ -47,10 +47,10 @@ def test_results_come_as_they_are_done_and_what_is_left_ends_with_the_caller(tmp
 
 PROGRAM = (
     "from functools import partial; from pathlib import Path; from test_processes import begun\n"
-    "from distrace.processes import each_done\n"
+    "from distrace.processes import parallel_map\n"
     "if __name__ == '__main__':\n"
     "    import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells have jobs ignore it
-    "    try: list(each_done(partial(begun, Path(r'{folder}')), [300], 1))\n"
+    "    try: list(parallel_map(partial(begun, Path(r'{folder}')), [300], 1))\n"
     "    except KeyboardInterrupt: print('stopped')\n"
 )
 

@@ -416,6 +416,10 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     assert result["rows"][0]["views_held_out"] == 2
     assert result["rows"][0]["method"] == "ours"
     assert {"psnr", "psnr_corrected", "psnr_aligned"} <= result["rows"][0].keys()
+    for frame in json.loads((out / "transforms.json").read_text())["frames"]:
+        assert (out / frame["file_path"]).is_file()
+        pose = np.array(frame["transform_matrix"]) @ np.diag([1, -1, -1, 1])
+        assert np.array_equal(pose, result["cameras"][Path(frame["file_path"]).stem]["T_world_camera"])
     for name in ("mesh.ply", "mesh.obj"):
         mesh = trimesh.load(out / name)
         assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)

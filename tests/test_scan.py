@@ -13,7 +13,7 @@ from distrace.camera import Camera
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
 from distrace.data.scan import Scan, canonical_scan, joined, scan_of_points, scan_of_view
-from distrace.data.scan_files import ScanOptions, load_scan
+from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.data.up import Up
 from distrace.errors import DoubtfulResult
 from distrace.files import save_arrays

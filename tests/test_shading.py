@@ -6,24 +6,16 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
+from seen_ball import BALL, camera_and_buffers
 
 from distrace import shading
 from distrace.camera import Camera
-from distrace.fields.primitives import sphere
 from distrace.render import Buffers, render
 
 CENTRE, CORNER = (24, 24), (0, 0)
 
 
-@pytest.fixture(scope="module")
-def camera() -> Camera:
-    return Camera.orbit(30, 20, 4.0, height=48, width=48)
-
-
-@pytest.fixture(scope="module")
-def seen(camera: Camera) -> Buffers:
-    with torch.no_grad():
-        return render(sphere(0.7), camera)
+camera, seen = camera_and_buffers(48, 48)
 
 
 def pictures(seen: Buffers) -> dict[str, np.ndarray]:
@@ -108,7 +100,7 @@ def test_clay_is_lit_from_the_upper_left(seen: Buffers) -> None:
 def test_clay_is_lit_where_the_camera_looks_straight_down() -> None:
     camera = Camera.orbit(0, 90, 4.0, height=48, width=48)
     with torch.no_grad():
-        seen = render(sphere(0.7), camera)
+        seen = render(BALL, camera)
     drawn = shading.shaded_picture(seen.normal, seen.mask, seen.rays.directions)
     assert 120 < drawn[CENTRE].mean() < 250
 

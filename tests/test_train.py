@@ -24,12 +24,12 @@ from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
 from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import NetworkSpecs
-from distrace.files import alone
+from distrace.files import run_lock
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.fine_tuning import CERTAIN, REACH, Kept, dwelling
+from distrace.training.fine_tuning import CERTAIN, REACH, Distillation, oversampled
 from distrace.training.losses import training_loss
 from distrace.training.trainer import Step, Training, begin_with, bound_codes, start, train
 
@@ -228,7 +228,7 @@ def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> Non
     """A ball of 0.4 is wrong for one of 0.5 between them, and up to REACH away samples count as well."""
     samples = replace(spheres(0.5, 0.5, 0.5), names=["ball", "ball~1", "unknown"])
     model = Model("balls", Spheres(), torch.tensor([[0.4, 0, 0, 0]]).repeat(2, 1), ("ball", "ball~1"))
-    dwelt = dwelling(samples, model, 5)
+    dwelt = oversampled(samples, model, 5)
     radii = {}
     for side in ("outside", "inside"):
         before, after = getattr(samples, side), getattr(dwelt, side)
@@ -245,7 +245,7 @@ def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> Non
 
 def test_a_model_that_is_right_leaves_the_samples_as_they_are() -> None:
     samples = spheres(0.5)
-    dwelt = dwelling(samples, Model("balls", Spheres(), torch.tensor([[0.5, 0, 0, 0]]), ("sphere0",)), 5)
+    dwelt = oversampled(samples, Model("balls", Spheres(), torch.tensor([[0.5, 0, 0, 0]]), ("sphere0",)), 5)
     assert torch.equal(dwelt.outside[0], samples.outside[0])
     assert torch.equal(dwelt.inside[0], samples.inside[0])
 
@@ -278,7 +278,7 @@ def test_a_model_stays_what_it_was_between_its_shapes_if_it_is_to(tmp_path: Path
     config = replace(CONFIG, steps=300, warm_up=10)
     known = finished(spheres(0.3, 0.6), config)
     save_experiment(tmp_path, known.decoder, known.codes, ("sphere0", "sphere1"))
-    kept = Kept.of(model := load_model(tmp_path), names := ["sphere0", "new", "sphere1"])
+    kept = Distillation.of(model := load_model(tmp_path), names := ["sphere0", "new", "sphere1"])
     points, codes = torch.rand(50, 200, 3) - 0.5, kept.drawn(torch.arange(3).repeat(50)[:50])
     changes = []
     for keep in (0.0, 10.0):
@@ -307,7 +307,7 @@ def test_a_model_that_is_kept_keeps_the_shapes_that_no_sample_tells(tmp_path: Pa
 
 def test_codes_at_which_a_model_is_kept_are_as_usual_as_its_own() -> None:
     codes = 0.3 * torch.randn(40, 4, generator=torch.Generator().manual_seed(0)) + 1
-    kept = Kept.of(Model("some", Spheres(), codes, tuple(map(str, range(40)))), [*map(str, range(40)), "new"])
+    kept = Distillation.of(Model("some", Spheres(), codes, tuple(map(str, range(40)))), [*map(str, range(40)), "new"])
     torch.testing.assert_close(kept.codes[40], codes.mean(0))
     torch.manual_seed(0)
     drawn = torch.cat([kept.drawn(torch.arange(40)) for _ in range(200)])
@@ -514,7 +514,7 @@ def test_a_run_that_is_done_does_nothing_more(tmp_path: Path, run, capsys: pytes
 def test_a_folder_that_another_run_is_writing_is_left_to_it(tmp_path: Path, run, capsys) -> None:
     samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
     out.mkdir()
-    with alone(out), pytest.raises(SystemExit):
+    with run_lock(out), pytest.raises(SystemExit):
         run("train", samples, "--out", out, *TINY)
     assert f"another run is writing {out}; wait for its end, or give another --out" in capsys.readouterr().err
     assert [path.name for path in out.iterdir()] == [".lock"]

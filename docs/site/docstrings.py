@@ -15,8 +15,7 @@ class Docstrings(griffe.Extension):
         if obj.docstring is not None:
             value = re.sub(r" *# doctest: .*", "", obj.docstring.value)
             obj.docstring.value = EXAMPLE.sub(lambda match: f"```pycon\n{match[0]}\n```", value)
-        elif obj.is_attribute and obj.parent is not None and obj.parent.is_class and obj.lineno:
-            lines = obj.lines_collection[obj.filepath][obj.lineno - 1 : obj.endlineno]
-            _, _, comment = " ".join(lines).partition("  # ")
+        elif obj.is_attribute and obj.parent is not None and obj.parent.is_class:
+            _, _, comment = " ".join(obj.lines).partition("  # ")
             if comment:
                 obj.docstring = griffe.Docstring(comment[:1].upper() + comment[1:] + ".", parent=obj)

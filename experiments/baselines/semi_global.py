@@ -18,7 +18,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.photograph import Photograph
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.photos.stereo_pairs import neighbour_views
 
 PARTNERS = 2  # of each view
@@ -150,7 +150,7 @@ def _one_per_cell(points: Float[Tensor, "n 3"]) -> Float[Tensor, "m 3"]:
 
 def _opencv() -> Any:
     """Imports OpenCV. Raises `ValueError` where it is not installed."""
-    with explained(
+    with error_context(
         "classical stereo needs OpenCV, which is not installed; `pip install 'distrace[clips]'` installs it"
     ):
         return importlib.import_module("cv2")

@@ -18,8 +18,8 @@ from PIL import Image
 
 from distrace.camera import Camera
 from distrace.data.shapes import Shape
-from distrace.errors import explained
-from distrace.files import save_json, written
+from distrace.errors import error_context
+from distrace.files import atomic_write, save_json
 from distrace.shading import Picture, save_png
 from experiments.datasets.splits import on_side
 
@@ -90,7 +90,7 @@ def begin(folder: Path, clip: Clip) -> None:
     path = folder / "clip.json"
     if not path.exists():
         return save_json(path, asdict(clip))
-    with explained(f"{path} cannot be read; move it or choose another --out"):
+    with error_context(f"{path} cannot be read; move it or choose another --out"):
         content = dict(json.loads(path.read_text(encoding="utf-8")))
     different = [f"{name} {content.get(name)}" for name, value in asdict(clip).items() if content.get(name) != value]
     if different:
@@ -114,9 +114,9 @@ def save_frame(
     depth: Float[np.ndarray, "height width"],
 ) -> None:
     """Writes the image, and in `truth/` the mask (255 is the shape) and the depth z, `inf` on the background."""
-    with written(folder / f"truth/depth/{frame:03d}.npy") as file:
+    with atomic_write(folder / f"truth/depth/{frame:03d}.npy") as file:
         np.save(file, depth)
-    with written(folder / f"truth/masks/{frame:03d}.png") as file:
+    with atomic_write(folder / f"truth/masks/{frame:03d}.png") as file:
         Image.fromarray(mask.astype(np.uint8) * 255).save(file, "PNG")
     save_png(folder / image_name(frame), image)
 

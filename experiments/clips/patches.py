@@ -16,7 +16,7 @@ from PIL import Image
 
 from distrace.data.ac3d import Surfaces, load_surfaces
 from distrace.data.solid import bounding, normalised_frame, turn_matrix
-from distrace.errors import explained
+from distrace.errors import error_context
 from experiments.clips.solid_texture import mottled
 
 LEAST_TEXTURED = 0.25  # share of the area under images of more than one colour
@@ -44,7 +44,7 @@ class Patch:
 
 def load_patches(path: Path) -> list[Patch]:
     """Returns all triangles of a file. Raises `ValueError` for a file that cannot be read."""
-    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file"):
+    with error_context(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file"):
         return _of_ac3d(path) if path.suffix.lower() == ".ac" else _of_trimesh(path)
 
 

@@ -8,8 +8,9 @@ import tyro
 
 from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
+from distrace.checkpoints.codes import named_code
 from distrace.cli.bench import finish, rows_of, show
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.common import CodeName, ModelName, opened, show_table
 from distrace.cli.console import origin, progress, start
 from distrace.files import save_json, save_text
 from experiments.costs import backward, boundary_gradients, fields, gradients, growth, pages, solvers
@@ -24,13 +25,14 @@ class Fields:
 
     model: Name = "sofas"
     out: Path = Path("out/fields")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
     size: int = 512  # pixels along each side
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
-        decoder = opened(self.model, run.device).field(self.code)
+        model = opened(self.model, run.device)
+        decoder = model.field(named_code(model, self.code))
         rows = []
         with progress("fields", fields.COUNT) as bar:
             for row in fields.field_rows(decoder, poster_view(self.size).to(run.device)):
@@ -46,14 +48,14 @@ class Growth:
 
     model: Name = "sofas"
     out: Path = Path("out/growth")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
     repeats: int = 5  # timed runs of each row, after one to warm up; a row of over a minute runs once
     device: str = "cpu"
 
     def run(self) -> None:
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
-        field = model.field(self.code)
+        field = model.field(named_code(model, self.code))
         axes = (
             growth.by_size(field, self.repeats, run.device),
             growth.by_network(self.repeats, run.device),
@@ -77,11 +79,11 @@ class Memory:
 
     model: Name = "sofas"
     out: Path = Path("out/memory")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
 
     def run(self) -> None:
         run = start(self.out)
-        opened(self.model, run.device)
+        named_code(opened(self.model, run.device), self.code)  # so that a wrong name ends here
         rows = []
         with progress("memory", len(growth.MEASURED)) as bar:
             for size in growth.MEASURED:
@@ -99,7 +101,7 @@ class Gradients:
 
     model: Name = "sofas"
     out: Path = Path("out/gradients")
-    code: int = 0  # which training shape
+    code: CodeName = "0"
     size: int = 64  # pixels along each side
     repeats: int = 5  # timed backward passes of a 512 × 512 image, after one to warm up
     device: str = "cpu"  # of these passes
@@ -107,7 +109,8 @@ class Gradients:
     def run(self) -> None:
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
-        subjects = gradients.subjects(model, self.code, self.size)
+        code = named_code(model, self.code)
+        subjects = gradients.subjects(model, code, self.size)
         rows = []
         ratios = []
         with progress("gradients", gradients.COUNT) as bar:
@@ -117,7 +120,7 @@ class Gradients:
                     ratios.append(ratio.numpy())
                     bar.advance(f"{row.field} by {row.parameter}, {row.method}")
         save_text(run.out / "index.html", pages.gradients_page(rows, ratios))
-        times = backward.timings(model, self.code, poster_view().to(run.device), self.repeats)
+        times = backward.timings(model, code, poster_view().to(run.device), self.repeats)
         facts = rows_of(self.model, rows)
         timing = rows_of(self.model, times)
         show(facts)

@@ -11,7 +11,7 @@ import tyro
 from distrace.cli.common import show_table
 from distrace.cli.console import console, origin, progress, start
 from distrace.files import save_text
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.datasets.splits import CLASSES, Meshes
 from experiments.tables import depth_tables
 from experiments.tables.clip_page import save_clip_page
@@ -54,7 +54,7 @@ class _DepthTable:
         trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
         results: list[Done] = []
         with progress(name, len(trials)) as bar:
-            for each in each_done(partial(done, place), trials, self.jobs):
+            for each in parallel_map(partial(done, place), trials, self.jobs):
                 results.append(each)
                 bar.advance(f"{each.trial.shape}, {each.trial.method}: {each.chamfer:.2f}")
         order = {trial: number for number, trial in enumerate(trials)}
@@ -102,7 +102,7 @@ class Focal(_DepthTable):
         usual = [trial for trial in trials if trial.focal_ratio == 1.0]
         renderings: list[Rendering] = []
         with progress("rendering at other focal lengths", len(usual)) as bar:
-            for of_trial in each_done(partial(renderings_of, place), usual, self.jobs):
+            for of_trial in parallel_map(partial(renderings_of, place), usual, self.jobs):
                 renderings += of_trial
                 bar.advance()
         rows = sorted(
@@ -170,7 +170,7 @@ class Multiview:
         }
         trials = [trial for of_clip in trials_of.values() for trial in of_clip]
         with progress("multiview", len(trials)) as bar:
-            for each in each_done(clip_done, trials, self.jobs):
+            for each in parallel_map(clip_done, trials, self.jobs):
                 results.append(each)
                 bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
         results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.commands.depth import checked, paired
 from experiments.datasets.splits import CLASSES, Meshes
 from experiments.tables.placement import Placed, placed, placement_rows, placement_trials, verdict_rows
@@ -51,4 +51,4 @@ class Placement:
     def _results(self, place: Place, trials: Sequence):
         """Returns the results; of one job in this process, with all of its threads."""
         work = partial(placed, place)
-        return map(work, trials) if self.jobs == 1 else each_done(work, trials, self.jobs)
+        return map(work, trials) if self.jobs == 1 else parallel_map(work, trials, self.jobs)

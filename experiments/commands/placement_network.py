@@ -10,7 +10,7 @@ import tyro
 
 from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.fitting.placement_network import FILE, PlacementNetwork
 from experiments.datasets.splits import Meshes, on_side
 from experiments.networks.scans import ScanMaker, TrainingScans, joined_scans
@@ -64,5 +64,5 @@ def save_network(path: Path, network: PlacementNetwork) -> None:
     tensors: dict[str, torch.Tensor] = {}
     for name, tensor in network.state_dict().items():
         tensors[name] = (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
-    with written(path) as file:
+    with atomic_write(path) as file:
         file.write(safetensors.torch.save(tensors))

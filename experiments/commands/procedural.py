@@ -10,7 +10,7 @@ import tyro
 from distrace.benchmarks.measuring import poster_view
 from distrace.cli.console import progress, start
 from distrace.data.solid import Solid, normalised
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.shading import grid, save_png
 from experiments.datasets.pictured import pictured
 from experiments.procedural import procedural_mesh
@@ -37,7 +37,7 @@ class Procedural:
         with progress("shapes", self.count) as bar:
             for number in range(1, self.count + 1):
                 mesh = procedural_mesh(self.category, np.random.default_rng([self.seed, number]))
-                with written(run.out / f"{self.category}~{number}.ply") as part:
+                with atomic_write(run.out / f"{self.category}~{number}.ply") as part:
                     mesh.export(part, file_type="ply")
                 if number <= PREVIEWED:
                     scaled = normalised(mesh)

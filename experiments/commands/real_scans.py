@@ -9,14 +9,14 @@ import tyro
 
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
-from distrace.cli.common import save_meshes, show_table
+from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
-from distrace.data.scan_files import ScanOptions, load_scan
+from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.placement_network import load_placement_network
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.prior import prior_of
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.commands.depth import checked
 
 CHAIR = (360, 120, 570, 480)  # left, top, right, bottom of the chair in the depth image of the first frame
@@ -51,7 +51,7 @@ class RealScans:
         work = partial(completed, run.out, self.resolution, self.seed)
         rows = []
         with progress("real scans", len(given)) as bar:
-            for row in map(work, given) if self.jobs == 1 else each_done(work, given, self.jobs):
+            for row in map(work, given) if self.jobs == 1 else parallel_map(work, given, self.jobs):
                 rows.append(row)
                 bar.advance(f"{row['input']}: {row['verdict']}")
         names = [each.name for each in given]
@@ -66,11 +66,10 @@ def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:
     model = load_model(given.model)
     network = load_placement_network(given.model)
     fit = fit_scan(model.decoder, scan, prior_of(model.codes), ScanFitConfig(seed=seed), network=network)
-    mesh = extract_mesh(model.field(fit.code), MeshConfig(resolution))
-    mesh.apply_transform(fit.place.T_world_object.double().numpy())
+    mesh = mesh_in_world(extract_mesh(model.field(fit.code), MeshConfig(resolution)), fit.place)
     folder = start(out / given.name).out
     save_code(folder, fit.code, fit.place)
-    save_meshes(folder, mesh, ("ply",))
+    save_mesh(folder / "mesh.ply", mesh)
     verdict = fit.verdict
     return {
         "input": given.name,

@@ -10,7 +10,7 @@ from distrace.cli.common import ModelName, opened, show_table
 from distrace.cli.console import Run, console, origin, progress, start
 from distrace.files import save_json, save_text
 from distrace.fitting.fit_code import CodeFitConfig
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from distrace.report.page import figure, page, section, table
 from experiments.datasets.splits import Meshes, on_side
 from experiments.tables import pose as pose_table
@@ -93,7 +93,7 @@ class Pose:
         done = {found.trial for found in finished}
         missing = [trial for trial in pose_table.all_trials(self.cameras) if trial not in done]
         with progress("cameras", len(missing)) as bar:
-            for found in each_done(partial(pose_table.found, self.model), missing, self.jobs):
+            for found in parallel_map(partial(pose_table.found, self.model), missing, self.jobs):
                 finished.append(found)
                 pose_table.write_trials(trials, self.model, finished)
                 bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")

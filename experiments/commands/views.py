@@ -15,7 +15,7 @@ from distrace.benchmarks.random_views import View
 from distrace.checkpoints.model import Model, load_model
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.console import start
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.files import save_arrays
 from experiments.fields.analytic import NAMES, analytic_views
 
@@ -37,7 +37,7 @@ class FieldPlan(Plan):
         """Reads the reference of a view, or computes and keeps it. Raises `ValueError` for a file that holds none."""
         path = self.references and self.references / f"{_digest(view)}.npz"
         if path and path.exists():
-            with explained(f"{path} holds no reference; delete it to compute it again"), np.load(path) as content:
+            with error_context(f"{path} holds no reference; delete it to compute it again"), np.load(path) as content:
                 return torch.from_numpy(content["depth"]).to(view.device), float(content["seconds"])
         depth, seconds = super().reference(view)
         if path:

@@ -5,6 +5,8 @@ from dataclasses import dataclass, replace
 from statistics import median
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
@@ -25,11 +27,11 @@ class Timing:
     runs: int
 
 
-def timings(model: Model, code: int, camera: Camera, repeats: int) -> list[Timing]:
+def timings(model: Model, code: Float[Tensor, "length"], camera: Camera, repeats: int) -> list[Timing]:
     """Times a depth image of the default tracer and its backward pass, by code and by camera, after a warm-up run."""
     runs: dict[str, list[tuple[float, float, int]]] = {"code": [], "camera": []}
     for _ in range(repeats + 1):
-        runs["code"].append(_timed(model.field(model.codes[code].detach().clone().requires_grad_()), camera))
+        runs["code"].append(_timed(model.field(code.detach().clone().requires_grad_()), camera))
         runs["camera"].append(_timed(model.field(code), _attached(camera)))
     return [_timing(name, camera, times[1:] or times) for name, times in runs.items()]
 

@@ -54,11 +54,11 @@ class Subject:
     moves: dict[str, Move]
 
 
-def subjects(model: Model, code: int, size: int) -> list[Subject]:
+def subjects(model: Model, code: Float[Tensor, "length"], size: int) -> list[Subject]:
     """Returns a sphere, a box that shows a face at 6° from its plane, and a decoder; all in float64."""
     half = torch.tensor(HALF, dtype=torch.float64)
     decoder = deepcopy(model.decoder).double().cpu()
-    latent = model.codes[code].detach().double().cpu()
+    latent = code.detach().double().cpu()
     lens = ("focal length",)
     return [  # the focal lengths let each shape fill its image
         _subject("sphere", sphere(RADIUS), _camera(30, 20, 130, size), {"radius": lambda h: sphere(RADIUS + h)}),

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from distrace.benchmarks.measuring import in_turn, poster_view
 from distrace.camera import Camera
+from distrace.checkpoints.codes import named_code
 from distrace.checkpoints.model import Model, load_model
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
@@ -113,14 +114,15 @@ def _rows(axis: str, value: str, runs: Runs, repeats: int) -> Iterator[GrowthRow
         yield GrowthRow(axis, value, name, visible, queries, queries / max(visible, 1), operations, seconds, times)
 
 
-def peak_memory(model: str, code: int, size: int) -> float:
+def peak_memory(model: str, code: str, size: int) -> float:
     """Returns the MiB that rendering the poster's view adds to the process; it uses a process of its own."""
     with get_context("spawn").Pool(1) as pool:
         return pool.apply(_peak, (model, code, size))
 
 
-def _peak(model: str, code: int, size: int) -> float:
-    field = load_model(model).field(code)
+def _peak(name: str, code: str, size: int) -> float:
+    model = load_model(name)
+    field = model.field(named_code(model, code))
     with torch.no_grad():
         render(field, poster_view(32))
         Path("/proc/self/clear_refs").write_text("5")  # resets the peak

@@ -12,7 +12,7 @@ from distrace.data.scan import Scan, scan_of_view
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, normalised
 from distrace.data.up import Up
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.fitting.placement_network import POINTS
 from experiments.datasets.sensor import Scene, sensed
 from experiments.datasets.solids import solid_of
@@ -48,7 +48,7 @@ class TrainingScans:
         return TrainingScans(*(getattr(self, field.name)[index] for field in fields(self)))
 
     def save(self, path: Path) -> None:
-        with written(path) as file:
+        with atomic_write(path) as file:
             torch.save({field.name: getattr(self, field.name) for field in fields(self)}, file)
 
     @staticmethod

@@ -32,7 +32,7 @@ def sofa(random: np.random.Generator, wide: float | None = None) -> list[Part]:
     if arm:
         parts += arms(random, wide, arm, deep, (floor, seat, random.uniform(seat + 0.04, high)))
     if random.random() < 0.3 and wide > 1.3:
-        parts += chaise(random, wide, arm, deep, (floor, base, seat, high), thick, soft)
+        parts += chaise(random, wide, deep, (floor, base, seat, high), thick, soft)
     if floor:
         parts += feet(random, wide, deep, floor)
     for _ in range(random.integers(0, 4) if random.random() < 0.35 else 0):
@@ -115,7 +115,6 @@ def arms(random: np.random.Generator, wide: float, arm: float, deep: float, heig
 def chaise(
     random: np.random.Generator,
     wide: float,
-    arm: float,
     deep: float,
     heights: Sequence[float],
     thick: float,

@@ -15,7 +15,7 @@ from distrace.data.samples import sample
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid
 from distrace.fitting.fit_code import CodeFitConfig, fit_points
-from distrace.fitting.free_space import completed
+from distrace.fitting.free_space import pruned_mesh
 from distrace.mesh import MeshConfig, extract_mesh
 from distrace.metrics import chamfer
 from distrace.prior import prior_of
@@ -89,7 +89,7 @@ def completion_results(
         for method in METHODS:
             observation = observation_of(view, method)
             fit = completed_by(method, model, observation, config)
-            mesh = completed(model.field(fit.code), observation, MeshConfig(resolution))
+            mesh = pruned_mesh(model.field(fit.code), observation, MeshConfig(resolution))
             yield compared(shape.name, method, points, mesh, solid.surface, fit.seconds)
 
 

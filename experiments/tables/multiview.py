@@ -23,10 +23,10 @@ from distrace.checkpoints.model import Model
 from distrace.data.observation import View
 from distrace.data.photographs import Photograph, load_photographs
 from distrace.data.pictures import read_mask
-from distrace.errors import explained
-from distrace.files import save_json, written
+from distrace.errors import error_context
+from distrace.files import atomic_write, save_json
 from distrace.fitting.fit_code import CodeFitConfig, fit_code
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer, surface_points
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, fit_photos
 from distrace.photos.initialisation import Initialiser
@@ -110,14 +110,13 @@ def clip_done(trial: ClipTrial) -> ClipResult:
     else:
         code, place = _fitted(trial, model, clip)
         seconds = time.perf_counter() - start
-        surface = extract_mesh(model.field(code), MeshConfig(RESOLUTION))
-        surface.apply_transform(place.T_world_object.numpy())
+        surface = mesh_in_world(extract_mesh(model.field(code), MeshConfig(RESOLUTION)), place)
     true = true_solid(trial.meshes, clip["split"], clip["shape"]).surface
     distance = chamfer(surface, true)
     motion = remaining_motion(surface, true)
     names = clip["split"], clip["shape"], clip["background"], clip["texture"], trial.method
     result = ClipResult(*names, distance.to, distance.from_, seconds, *motion, [round(x, 6) for x in code.tolist()])
-    with written(trial.file(".ply")) as file:
+    with atomic_write(trial.file(".ply")) as file:
         (trimesh.PointCloud(surface) if isinstance(surface, np.ndarray) else surface).export(file, file_type="ply")
     save_json(trial.file(".json"), {"made_by": mark, **asdict(result)})
     return result
@@ -146,7 +145,7 @@ def remaining_motion(surface: Surface, true: trimesh.Trimesh) -> tuple[float, fl
 def described(folder: Path) -> dict[str, Any]:
     """Returns `clip.json`. Raises `ValueError` for a folder without one."""
     path = folder / "clip.json"
-    with explained(f"{path} is no description of a clip; `python -m experiments clip SHAPE` makes one"):
+    with error_context(f"{path} is no description of a clip; `python -m experiments clip SHAPE` makes one"):
         return dict(json.loads(path.read_text(encoding="utf-8")))
 
 

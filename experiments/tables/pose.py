@@ -11,7 +11,7 @@ import torch
 
 from distrace.camera import Camera
 from distrace.data.observation import View
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.files import save_json
 from distrace.fitting.fit_camera import CameraConfig, fit_camera
 from distrace.pose import object_in_camera, pose_error, turned_object, with_object_at, zoomed
@@ -79,7 +79,7 @@ def read_trials(path: Path, model: str) -> list[Found]:
     """Returns the trials of a file, none without a file. Raises `ValueError` for those of another model."""
     if not path.is_file():
         return []
-    with explained(f"{path} holds no trials; remove it to start again"):
+    with error_context(f"{path} holds no trials; remove it to start again"):
         content = json.loads(path.read_text())
         done = [Found(Trial(*(row.pop(part.name) for part in fields(Trial))), **row) for row in content["trials"]]
         owner = str(content["model"])

@@ -21,7 +21,7 @@ from distrace.data.shapes import Shape
 from distrace.data.solid import Solid
 from distrace.files import save_json
 from distrace.fitting.fit_code import CodeFitConfig
-from distrace.fitting.free_space import completed
+from distrace.fitting.free_space import pruned_mesh
 from distrace.metrics import chamfer
 from experiments.datasets.noise import NOISES, noisy
 from experiments.datasets.solids import observe, solid_of
@@ -170,7 +170,7 @@ def surface_of(
 ) -> trimesh.Trimesh | None:
     """Returns the completed mesh of a trial's code, or None where it has no surface."""
     try:
-        return completed(place.field_of(trial.category, code), observation, place.mesh)
+        return pruned_mesh(place.field_of(trial.category, code), observation, place.mesh)
     except ValueError:
         return None
 

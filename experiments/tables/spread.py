@@ -11,12 +11,12 @@ import torch
 from scipy.stats import rankdata
 
 from distrace.data.shapes import Shape
-from distrace.fitting.completing import complete_shape, plausible, spread
+from distrace.fitting.completing import complete_shape, posterior_codes, posterior_deviation
 from distrace.fitting.fit_code import CodeFitConfig
-from distrace.fitting.free_space import completed
+from distrace.fitting.free_space import pruned_mesh
 from distrace.mesh import MeshConfig
 from distrace.metrics import chamfer, surface_points
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 from experiments.datasets.solids import observe
 from experiments.tables.sparse_depth import camera_of, true_solid
 from experiments.tables.trials import hash_of, opened_once
@@ -41,7 +41,7 @@ class SpreadRow:
 
 def spread_rows(category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
     """Yields a row for each shape."""
-    return each_done(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
+    return parallel_map(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
@@ -51,11 +51,11 @@ def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:
     view = replace(observe(truth, camera_of(0)), normal=None).sparse(POINTS, seed)
     began = time.perf_counter()
     fit = complete_shape(network, view, CodeFitConfig())
-    others, _ = plausible(network, view, COMPLETIONS, CodeFitConfig(seed=seed))
+    others, _ = posterior_codes(network, view, COMPLETIONS, CodeFitConfig(seed=seed))
     seconds = time.perf_counter() - began
-    mesh = completed(network.field(fit.code), view, MeshConfig())
+    mesh = pruned_mesh(network.field(fit.code), view, MeshConfig())
     points = surface_points(mesh, SURFACE_POINTS, seed=0)
-    deviation = spread(network, others, torch.tensor(points, dtype=torch.float32)).numpy()
+    deviation = posterior_deviation(network, others, torch.tensor(points, dtype=torch.float32)).numpy()
     error = truth.apart(points)
     calm = deviation < np.median(deviation)
     return SpreadRow(

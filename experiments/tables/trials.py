@@ -14,7 +14,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.checkpoints.model import Model, load_model
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.fields.base import SDF
 from distrace.mesh import MeshConfig
 
@@ -62,7 +62,7 @@ def opened_once(name: str, device: torch.device = torch.device("cpu")) -> Model:
 
 def read_json(path: Path) -> Any:
     """Returns a trial's file. Raises `ValueError` for a file that is not JSON."""
-    with explained(f"{path} holds no trials; remove it to start again"):
+    with error_context(f"{path} holds no trials; remove it to start again"):
         return json.loads(path.read_text())
 
 

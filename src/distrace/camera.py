@@ -212,12 +212,6 @@ class Camera(ByValue):
         turn = self.T_world_camera.new_tensor([[cosine, 0, sine, 0], [0, 1, 0, 0], [-sine, 0, cosine, 0], [0, 0, 0, 1]])
         return replace(self, T_world_camera=turn @ self.T_world_camera)
 
-    def scaled(self, factor: float) -> "Camera":
-        """Returns the same view of a world whose lengths are × factor."""
-        pose = self.T_world_camera.clone()
-        pose[..., :3, 3] *= factor
-        return replace(self, T_world_camera=pose)
-
     def detach(self) -> "Camera":
         return replace(self, intrinsics=self.intrinsics.detach(), T_world_camera=self.T_world_camera.detach())
 

@@ -21,7 +21,7 @@ class DoubtfulResult(UserWarning):
 
 
 @contextmanager
-def explained(sentence: str, file: Path | None = None) -> Generator[None, None, None]:
+def error_context(sentence: str, file: Path | None = None) -> Generator[None, None, None]:
     """Raises any error inside again as `ValueError(sentence)`, with its cause.
 
     The cause is what lies in place of `file`, if that is a Git LFS pointer or a web page; else the error's first

@@ -13,7 +13,7 @@ from torch import Tensor
 
 
 @contextmanager
-def written(path: str | Path) -> Generator[BinaryIO, None, None]:
+def atomic_write(path: str | Path) -> Generator[BinaryIO, None, None]:
     """Opens a file to write; it gets the name `path` once all of it is on the disk.
 
     A symbolic link of that name is replaced, not followed. Parts that killed processes left of the file are removed.
@@ -33,7 +33,7 @@ def written(path: str | Path) -> Generator[BinaryIO, None, None]:
 
 
 @contextmanager
-def alone(folder: str | Path) -> Generator[None, None, None]:
+def run_lock(folder: str | Path) -> Generator[None, None, None]:
     """Locks a folder for this process. Raises `ValueError` if another one holds the lock."""
     from filelock import FileLock, Timeout
 
@@ -47,7 +47,7 @@ def alone(folder: str | Path) -> Generator[None, None, None]:
 
 def save_text(path: str | Path, text: str) -> None:
     """Writes a text in UTF-8."""
-    with written(path) as file:
+    with atomic_write(path) as file:
         file.write(text.encode())
 
 
@@ -60,7 +60,7 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Tensor], words: Mapping[s
     """Writes tensors, and single words, as `.npz`."""
     content: dict[str, Any] = {name: array.detach().cpu().numpy() for name, array in arrays.items()}
     content |= {name: np.array(word) for name, word in words.items()}
-    with written(path) as file:
+    with atomic_write(path) as file:
         np.savez_compressed(file, **content)
 
 

@@ -2,16 +2,19 @@
 
 import warnings
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from distrace.errors import DoubtfulResult
 from distrace.fields.base import SDF, check_field, chunked, evaluate_checked, pruned
 from distrace.fields.lipschitz import percentile_99, typical_slope
+from distrace.files import atomic_write
+from distrace.pose import Similarity
 from distrace.surface import directions_of_taps
 
 if TYPE_CHECKING:
@@ -35,7 +38,7 @@ class MeshConfig:
 
     resolution: int = 256
     radius: float = 1.0  # everything beyond counts as outside: decoders are not trained there
-    steepest: float = 1.5  # a bound on |∇f|, raised where it is exceeded; it excludes cells without surface
+    lipschitz: float = 1.5  # a bound on |∇f|, raised where it is exceeded; it excludes cells without surface
     device: torch.device = torch.device("cpu")
 
     def __post_init__(self) -> None:
@@ -70,19 +73,48 @@ def extract_mesh(sdf: SDF, config: MeshConfig = MeshConfig()) -> "trimesh.Trimes
     field = _Watched(sdf if hasattr(sdf, "pruned") else chunked(sdf, CHUNK), config.radius)
     values_on_ball = field(config.radius * directions_of_taps(torch.empty(0, device=config.device)))
     slope, _ = typical_slope(field, torch.empty(0, device=config.device), config.radius)
-    if slope > config.steepest:
-        config = replace(config, steepest=SLOPE_MARGIN * slope)
+    if slope > config.lipschitz:
+        config = replace(config, lipschitz=SLOPE_MARGIN * slope)
     grid = _values(field, config)
     for _ in range(MAX_ROUNDS):
         slope = _slope_at_surface(grid, config)
-        if slope <= SLOPE_TOLERANCE * config.steepest:
+        if slope <= SLOPE_TOLERANCE * config.lipschitz:
             break
-        config = replace(config, steepest=SLOPE_MARGIN * slope)
+        config = replace(config, lipschitz=SLOPE_MARGIN * slope)
         grid = _values(field, config)
     _warn_of_doubts(field, values_on_ball, config)
     evaluated = np.isfinite(grid)
     vertices, faces, _, _ = marching_cubes(np.where(evaluated, grid, 1.0), 0.0, mask=_whole_cells(evaluated))
     return trimesh.Trimesh(vertices * config.width - config.radius, faces, process=False)
+
+
+def mesh_in_world(mesh: "trimesh.Trimesh", place: Similarity) -> "trimesh.Trimesh":
+    """Returns a copy of a mesh of the object's frame in the world, moved in double precision."""
+    return mesh.copy().apply_transform(place.T_world_object.double().cpu().numpy())
+
+
+def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the sRGB colours of its vertices.
+
+    A GLB holds the same colours in linear light, as glTF 2.0 has them (section 3.7.2.1).
+    """
+    from trimesh.visual import ColorVisuals
+
+    kind = path.suffix.removeprefix(".")
+    if kind == "glb" and isinstance(mesh.visual, ColorVisuals) and mesh.visual.kind == "vertex":
+        colours = _in_linear_light(np.asarray(mesh.visual.vertex_colors))
+        mesh = mesh.copy()
+        mesh.visual = ColorVisuals(mesh, vertex_colors=colours)
+    options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
+    with atomic_write(path) as file:
+        mesh.export(file, file_type=kind, **options)
+
+
+def _in_linear_light(colours: UInt8[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
+    """Returns sRGB colours in linear light (IEC 61966-2-1); the fourth column, the opacity, is linear already."""
+    srgb = colours[:, :3] / 255
+    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.hstack([np.rint(255 * light).astype(np.uint8), colours[:, 3:]])
 
 
 class _Watched:
@@ -137,7 +169,7 @@ def _values(sdf: _Watched, config: MeshConfig) -> np.ndarray:
             raise ValueError(f"{sdf}, and has no zero elsewhere: there is no surface to extract")
         raise ValueError(
             f"the field has no zero within {config.radius} of the origin: there is no surface to extract; if"
-            f" there is, the field is steeper than {config.steepest:.3g} per length: give a larger `steepest`"
+            f" there is, the field is steeper than {config.lipschitz:.3g} per length: give a larger `lipschitz`"
         )
     grid = np.full([config.resolution + 1] * 3, np.nan, dtype=np.float32)
     grid[tuple(corners.cpu().numpy().T)] = _in_ball(values, points, config).cpu().numpy()
@@ -168,14 +200,14 @@ def _cells_at_surface(sdf: SDF, config: MeshConfig) -> tuple[Int[Tensor, "n 3"],
         width = config.width * 2**level
         centres = (cells + 0.5) * width - config.radius
         values, field = pruned(sdf, centres) if level == 1 else (evaluate_checked(sdf, centres), sdf)
-        near = _in_ball(values, centres, config).abs() <= config.steepest * width * 3**0.5 / 2
+        near = _in_ball(values, centres, config).abs() <= config.lipschitz * width * 3**0.5 / 2
         cells = (2 * cells[near][:, None] + halves).reshape(-1, 3)
     return cells, field
 
 
 def _in_ball(values: Float[Tensor, "n"], points: Float[Tensor, "n 3"], config: MeshConfig) -> Float[Tensor, "n"]:
     """Returns the field of the intersection of shape and ball; the ball's is scaled to the same slope."""
-    return values.maximum(config.steepest * (points.norm(dim=1) - config.radius))
+    return values.maximum(config.lipschitz * (points.norm(dim=1) - config.radius))
 
 
 def _corners(cells: Int[Tensor, "n 3"], along: int) -> Int[Tensor, "m 3"]:

@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from distrace.camera import Camera
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.optional import require
 from distrace.render import Buffers, Config, render
 from distrace.tracing.tracer import TracerConfig
@@ -56,7 +56,7 @@ def save_mp4(path: str | Path, pictures: Pictures) -> None:
 
     _, height, width, _ = _not_empty(pictures).shape
     even = np.pad(pictures, ((0, 0), (0, height % 2), (0, width % 2), (0, 0)), constant_values=255)
-    with written(path) as file:  # by its name: to bring the index to the front, the file is read again
+    with atomic_write(path) as file:  # by its name: to bring the index to the front, the file is read again
         with av.open(file.name, "w", format="mp4", options={"movflags": "faststart"}) as movie:
             stream = movie.add_stream("libx264", rate=1 / FRAME, options={"crf": "18"})
             stream.height, stream.width = even.shape[1:3]
@@ -83,7 +83,7 @@ def save_gif(path: str | Path, pictures: Pictures) -> None:
     palette = Image.fromarray(pictures.reshape(-1, width, 3)).quantize()
     images = [Image.fromarray(picture) for picture in pictures]
     first, *others = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
-    with written(path) as file:
+    with atomic_write(path) as file:
         first.save(file, format="GIF", save_all=True, append_images=others, duration=round(1000 * FRAME), loop=0)
 
 

@@ -15,7 +15,7 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def each_done(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
+def parallel_map(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
     """Yields the result of each task as it completes, from `jobs` processes of one thread each.
 
     If the caller stops, by Ctrl-C or otherwise, the processes are terminated: their files must be whole or absent.

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
-from distrace.files import written
+from distrace.files import atomic_write
 
 Array = Tensor | np.ndarray
 Picture = UInt8[np.ndarray, "_ _ 3"]  # of any size: some are larger than what they are drawn from
@@ -171,7 +171,7 @@ def save_png(path: str | Path, picture: Picture | Rgba) -> None:
     """Writes a picture as PNG; the folder is made if it is missing."""
     from PIL import Image
 
-    with written(path) as file:
+    with atomic_write(path) as file:
         Image.fromarray(picture).save(file, format="PNG", optimize=True)
 
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.vectors import numbers
 
 Number = float | Tensor
@@ -100,5 +100,5 @@ def _precision(given: Sequence[Tensor]) -> torch.dtype:
 
 def _broadcast(subject: str, *parts: Tensor) -> tuple[Tensor, ...]:
     given = " and ".join(str(list(part.shape)) for part in parts)
-    with explained(f"{subject} of shapes {given} were given; they must have the same batch axes, or none"):
+    with error_context(f"{subject} of shapes {given} were given; they must have the same batch axes, or none"):
         return tuple(torch.broadcast_tensors(*parts))

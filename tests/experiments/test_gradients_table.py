@@ -16,7 +16,7 @@ from experiments.fields.untrained import ball
 @pytest.fixture(scope="module")
 def ratios() -> dict[tuple[str, str, str], tuple[RatioRow, Tensor]]:
     model = Model("ball", ball(3, 32).decoder, torch.zeros(1, 1), ("ball",))
-    rows = [line for subject in subjects(model, 0, 32) for line in ratio_rows(subject)]
+    rows = [line for subject in subjects(model, model.codes[0], 32) for line in ratio_rows(subject)]
     return {(row.field, row.parameter, row.method): (row, image) for row, image in rows}
 
 
@@ -48,7 +48,7 @@ def test_a_face_at_a_grazing_angle_is_among_the_boxs_pixels(ratios) -> None:
 
 def test_a_subject_counts_its_evaluations() -> None:
     model = Model("ball", ball(1, 8).decoder, torch.zeros(1, 1), ("ball",))
-    sphere_subject, *_ = subjects(model, 0, 16)
+    sphere_subject, *_ = subjects(model, model.codes[0], 16)
     assert sphere_subject.sdf.evaluations == 0
     list(ratio_rows(sphere_subject))
     assert sphere_subject.sdf.evaluations > 1000

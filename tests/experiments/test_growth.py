@@ -31,7 +31,7 @@ def test_a_row_for_every_size_strategy_network_and_number_of_views() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/clear_refs").exists(), reason="peaks are read from Linux")
 def test_memory_is_what_the_images_take_and_little_more() -> None:
-    small, large = growth.peak_memory("sofas", 0, 64), growth.peak_memory("sofas", 0, 256)
+    small, large = growth.peak_memory("sofas", "0", 64), growth.peak_memory("sofas", "0", 256)
     assert 0 <= small < 300
     assert large < 700  # 540 to 640: two activations of 100,000 points are 400
 

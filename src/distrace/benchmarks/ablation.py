@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from distrace.benchmarks.measuring import Case, reference_depth
@@ -28,12 +29,12 @@ def of_field(sdf: SDF, camera: Camera) -> Iterator[Case]:
         yield Case(name, lambda config=config: render(sdf, camera, config=config), truth)
 
 
-def of_model(model: Model, code: int, camera: Camera) -> Iterator[Case]:
+def of_model(model: Model, code: Float[Tensor, "length"], camera: Camera) -> Iterator[Case]:
     """Yields the cases of a decoder's shape, with DIST's original code and the default tracer's next view."""
     sdf = model.field(code)
     cases = list(of_field(sdf, camera))
     yield from cases[:-1]
-    yield Case("original", lambda: _original(model, model.codes[code], camera), cases[-1].truth)
+    yield Case("original", lambda: _original(model, code, camera), cases[-1].truth)
     yield cases[-1]
     first = render(sdf, camera)
     turned = camera.turned(TURN)

@@ -25,7 +25,7 @@ Reference = tuple[Float[Tensor, "size size"], float]
 """The depth by the reference, and its seconds."""
 
 LEAST_IOU = 0.995  # of a view
-SMALL = 1600  # pixels: a smaller object is judged by WRONG instead of by IoU
+SMALL_OBJECT = 1600  # pixels: a smaller object is judged by WRONG instead of by IoU
 WRONG = 8  # pixels missed or added
 LARGEST_LOSS = 8  # pixels of the largest connected part that is missed
 OFF_EACH = 5000  # one depth in so many may be an outlier, and one in every view
@@ -152,7 +152,7 @@ def _row(
 
 
 def _fails(row: ViewRow) -> tuple[str, ...]:
-    small = row.pixels < SMALL
+    small = row.pixels < SMALL_OBJECT
     met = {
         "wrong pixels": not small or row.missed + row.added <= WRONG,
         "IoU": small or row.iou >= LEAST_IOU,

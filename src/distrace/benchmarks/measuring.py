@@ -104,12 +104,12 @@ def _bisected(sdf: SDF, rays: Rays, outside: Float[Tensor, "n"], inside: Float[T
     return torch.full_like(inside, torch.inf).index_put((bracketed,), (low + high) / 2)
 
 
-def reference_depth(sdf: SDF, camera: Camera, radius: float = 1.0) -> Float[Tensor, "height width"]:
+def reference_depth(sdf: SDF, camera: Camera) -> Float[Tensor, "height width"]:
     """Returns the depth by `reference_distance`, with steps down to a twentieth of a pixel at the sphere's middle."""
     rays = camera.rays()
-    distance = max(float(camera.T_world_camera[:3, 3].norm()), 0.1 * radius)
+    distance = max(float(camera.T_world_camera[:3, 3].norm()), 0.1)
     finest = float(camera.pixel_angle().amin()) * distance / 20
-    return camera.depth(reference_distance(sdf, rays, meet_sphere(rays, radius), min(SMALLEST_STEP, finest)))
+    return camera.depth(reference_distance(sdf, rays, meet_sphere(rays, 1.0), min(SMALLEST_STEP, finest)))
 
 
 def measure(

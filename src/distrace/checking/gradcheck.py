@@ -15,7 +15,7 @@ from distrace.checking.retrace import DOUBLE, SINGLE, Footprints, Precision, Ret
 from distrace.fields.base import SDF, Counted
 
 STRAY = 0.01  # share of the pixels that may be off: one-sided differences miss some kinks of ReLU networks
-SMALL = 0.1  # × the median derivative: the scale of relative errors is never below it
+LEAST_SCALE = 0.1  # × the median derivative: the scale of relative errors is never below it
 ROUGHLY = 0.2  # median error up to which footprint normals agree: those of bundled models have 0.02 – 0.15
 
 Verdict = Literal["agrees", "disagrees", "zero"]
@@ -155,7 +155,7 @@ def compare(along: str, derivative: Tensor, difference: Tensor, kink: Tensor | N
     derivative = derivative.reshape(len(derivative), -1)
     difference = difference.reshape(len(difference), -1)
     size = difference.norm(dim=-1)
-    scale = size.clamp_min(max(precision.least, SMALL * float(size.nanmedian().nan_to_num())))
+    scale = size.clamp_min(max(precision.least, LEAST_SCALE * float(size.nanmedian().nan_to_num())))
     disagreement = torch.zeros_like(size) if kink is None else kink.reshape(len(kink), -1).norm(dim=-1)
     left_out = size.isnan() | ~(disagreement <= precision.tolerance * scale)
     error = ((derivative - difference).norm(dim=-1) / scale).nan_to_num(torch.inf, posinf=torch.inf)

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.checkpoints.model import Model, bundled_models
-from distrace.errors import explained
-from distrace.files import save_json, written
+from distrace.errors import error_context
+from distrace.files import atomic_write, save_json
 from distrace.pose import Similarity
 
 
@@ -21,9 +21,9 @@ def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
     if given.isdecimal():
         return model.code_of(int(given))
     if not given.endswith(".npy"):
-        with explained(f"{given} is neither the number nor the name of a training shape, nor a code.npy"):
+        with error_context(f"{given} is neither the number nor the name of a training shape, nor a code.npy"):
             return model.code_of(given)
-    with explained(f"{given} is no code that a command wrote", Path(given)):
+    with error_context(f"{given} is no code that a command wrote", Path(given)):
         code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
         if code.shape != model.codes.shape[1:]:
             length = model.codes.shape[1]
@@ -46,7 +46,7 @@ def model_source(name: str) -> str:
 
 def save_code(folder: Path, code: Float[Tensor, "length"], place: Similarity | None = None) -> None:
     """Writes a code, and the placement of its shape in the frame of the input where there is one."""
-    with written(folder / "code.npy") as file:
+    with atomic_write(folder / "code.npy") as file:
         np.save(file, code.detach().cpu().numpy())
     if place is not None:
         save_json(folder / "placement.json", {"T_input_object": place.T_world_object.tolist()})

@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.errors import DoubtfulResult, explained
+from distrace.errors import DoubtfulResult, error_context
 from distrace.fields.decoder import Decoder
-from distrace.files import written
+from distrace.files import atomic_write
 
 LATEST = "latest.pth"
 BESIDE = "homogen_network."  # a head of DeepSDFStruct's decoders that does not enter the distance
@@ -29,9 +29,9 @@ NUMPY += [(make, f"numpy.{core}.multiarray.{make.__name__}") for make in PICKLED
 def write_weights(folder: Path, decoder: Decoder, codes: Float[Tensor, "shapes length"]) -> None:
     """With the key names that DeepSDF's original code reads."""
     state = {_classic(key): value.detach().cpu() for key, value in decoder.state_dict().items()}
-    with written(folder / "ModelParameters" / LATEST) as file:
+    with atomic_write(folder / "ModelParameters" / LATEST) as file:
         torch.save({"epoch": 0, "model_state_dict": state}, file)
-    with written(folder / "LatentCodes" / LATEST) as file:
+    with atomic_write(folder / "LatentCodes" / LATEST) as file:
         torch.save({"epoch": 0, "latent_codes": {"weight": codes.detach().cpu()}}, file)
 
 
@@ -41,14 +41,14 @@ def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "
     Raises `ValueError`, in one sentence, for weights that are missing, and for a file that holds something else.
     """
     weights = _checkpoint(folder / "ModelParameters")
-    with explained(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict", weights):
+    with error_context(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict", weights):
         stored = _unpickled(weights)["model_state_dict"]
         state = {_modern(key): _tensor(value).float() for key, value in stored.items() if BESIDE not in key}
     latent = folder / "LatentCodes" / weights.name
     if not latent.is_file():
         warnings.warn(f"{latent} is missing: the model has a decoder, and no codes", DoubtfulResult, stacklevel=3)
         return weights, state, None
-    with explained(f"{latent} is not a file of DeepSDF codes with the key latent_codes", latent):
+    with error_context(f"{latent} is not a file of DeepSDF codes with the key latent_codes", latent):
         codes = _codes(_unpickled(latent))
     return weights, state, codes
 

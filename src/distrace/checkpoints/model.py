@@ -19,11 +19,11 @@ from torch import Tensor
 
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
 from distrace.equality import ByValue, summary
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.files import written
+from distrace.files import atomic_write
 
 BUNDLED = Path(__file__).parents[1] / "models"
 VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
@@ -123,7 +123,7 @@ def load_model(name: str | Path) -> Model:
     specs, shapes = _read_specs(folder)
     ours = folder / "model.safetensors"
     source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
-    with explained(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
+    with error_context(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
         decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
     decoder = _filled(decoder, state, source)
     if codes is None:
@@ -147,7 +147,7 @@ def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.floa
     for layer in range(model.decoder.depth):
         tensors[f"lin{layer}.weight"] = getattr(model.decoder, f"lin{layer}").weight
     _write_specs(folder, plain, model.shapes)
-    with written(folder / "model.safetensors") as file:
+    with atomic_write(folder / "model.safetensors") as file:
         file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
 
 
@@ -162,7 +162,7 @@ def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> 
     network = asdict(specs)
     length = network.pop("code_length")
     content = {"NetworkArch": "deep_sdf_decoder", "NetworkSpecs": network, "CodeLength": length, "Shapes": shapes}
-    with written(folder / "specs.json") as file:
+    with atomic_write(folder / "specs.json") as file:
         file.write(json.dumps(content, indent=1).encode())
 
 
@@ -172,7 +172,7 @@ def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
         raise ValueError(
             f"{folder} is not a DeepSDF experiment: it has no specs.json, which names the network's layers"
         )
-    with explained(f"{path} is not a DeepSDF specification", path):
+    with error_context(f"{path} is not a DeepSDF specification", path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))
         _check_architecture(content)
         network = content["NetworkSpecs"]
@@ -203,7 +203,7 @@ def _layers(network: dict, key: str) -> tuple[int, ...]:
 
 
 def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
-    with explained(f"{path} is not a safetensors file of a model", path):
+    with error_context(f"{path} is not a safetensors file of a model", path):
         tensors = {key: tensor.float() for key, tensor in safetensors.torch.load_file(path).items()}
         codes = tensors.pop("codes")
     return path, tensors, codes

@@ -11,9 +11,10 @@ from distrace.benchmarks import ablation
 from distrace.benchmarks.measuring import measure, poster_view
 from distrace.benchmarks.pictures import MAPPED, query_map
 from distrace.checking.gradcheck import check_gradients
+from distrace.checkpoints.codes import named_code
 from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
-from distrace.cli.common import default, opened, show_table
+from distrace.cli.common import CodeName, default, opened, show_table
 from distrace.cli.console import Run, origin, progress, start
 from distrace.shading import save_png, side_by_side
 
@@ -42,7 +43,7 @@ class Bench:
     ] = ()
     """a bundled model, a DeepSDF experiment folder, or a run of `train`; `views` takes any number, the others one"""
     out: Path = Path("out/bench")
-    code: int = 0  # number of the training shape
+    code: CodeName = "0"  # for `trace` and `gradients`
     size: int = 512  # pixels along each side, for `trace`; for `gradients` at most 48
     repeats: int = 5  # timed runs of each row, after a warm-up; a row that takes over a minute runs once
     views: int = 60  # for `views`: random views of each model
@@ -71,7 +72,7 @@ class Bench:
         camera = poster_view(self.size).to(run.device)
         cases = []
         with progress("references", ablation.COUNT) as bar:
-            for case in ablation.of_model(model, self.code, camera):
+            for case in ablation.of_model(model, named_code(model, self.code), camera):
                 cases.append(case)
                 bar.advance(case.strategy)
         with progress("runs", len(cases) * (self.repeats + 1 if self.repeats > 1 else 1)) as bar:
@@ -81,7 +82,8 @@ class Bench:
         finish(run, rows_of(self.model, [row for row, _ in measured]))
 
     def _gradients(self, run: Run, model: Model) -> None:
-        found = check_gradients(model.field(self.code), poster_view(min(self.size, CHECKED)).to(run.device))
+        field = model.field(named_code(model, self.code))
+        found = check_gradients(field, poster_view(min(self.size, CHECKED)).to(run.device))
         rows = [
             {
                 "model": self.model,

@@ -14,7 +14,8 @@ from distrace.camera import Camera
 from distrace.checkpoints.codes import model_source
 from distrace.checkpoints.model import Model, load_model
 from distrace.cli.console import Run, console
-from distrace.files import save_arrays, written
+from distrace.files import save_arrays
+from distrace.mesh import save_mesh
 from distrace.metrics import Chamfer
 from distrace.render import Buffers
 from distrace.report.page import short
@@ -126,14 +127,6 @@ def save_buffers(path: Path, buffers: Buffers, clearance: bool) -> None:
     if clearance:
         arrays["clearance"] = buffers.clearance
     save_arrays(path, arrays)
-
-
-def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices."""
-    kind = path.suffix.removeprefix(".")
-    options = {"header": "distrace", "include_texture": False} if kind == "obj" else {}  # OBJ without a .mtl
-    with written(path) as file:
-        mesh.export(file, file_type=kind, **options)
 
 
 def save_meshes(folder: Path, mesh: "trimesh.Trimesh", formats: Sequence[Format]) -> None:

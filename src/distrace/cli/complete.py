@@ -16,8 +16,8 @@ from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
-from distrace.data.scan_files import CLOUDS, ScanOptions, load_scan
-from distrace.errors import explained
+from distrace.data.scan_inputs import CLOUDS, ScanOptions, load_scan
+from distrace.errors import error_context
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.judge import Verdict
@@ -47,8 +47,8 @@ class Complete:
     inputs: tyro.conf.Positional[
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT …", help_behavior_hint="(required)")]
     ]
-    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one world:
-    depth images with --poses"""
+    """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one kind:
+    depth images with --poses, observations of one world, or clouds in one frame"""
     out: Path = Path("out/complete")
     up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
     """axis of the input's frame that points up, or `unknown`"""
@@ -116,7 +116,7 @@ class Complete:
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
         if len(self.inputs) > 1:
-            raise ValueError(f"{len(self.inputs)} inputs were given; one is completed in the canonical frame")
+            raise ValueError(f"{len(self.inputs)} inputs were given; give one, or --frame input, which takes several")
         path = next(iter(self.inputs))
         cloud = path.suffix.lower() in CLOUDS
         if cloud and (self.solver == "adam" or self.ignore):
@@ -164,7 +164,7 @@ class Demo:
 def _reference(path: Path) -> "trimesh.Trimesh | np.ndarray":
     import trimesh
 
-    with explained(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
+    with error_context(f"{path} is no mesh and no cloud of points; give a PLY of the true surface", path):
         loaded: Any = load_geometry(path)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()

@@ -13,19 +13,19 @@ from distrace.benchmarks.measuring import poster_view
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Format, chamfer_facts, save_mesh, save_meshes
+from distrace.cli.common import Format, chamfer_facts, save_meshes
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import canonical_scan
 from distrace.files import save_text
-from distrace.fitting.completing import complete_shape, plausible, spread
+from distrace.fitting.completing import complete_shape, posterior_codes, posterior_deviation
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFit, CodeFitConfig
-from distrace.fitting.free_space import LEFT_OUT, completed
+from distrace.fitting.free_space import PRUNED_PIECES, pruned_mesh
 from distrace.fitting.judge import Verdict, judged
-from distrace.mesh import MeshConfig
+from distrace.mesh import MeshConfig, save_mesh
 from distrace.metrics import Chamfer, chamfer, iou
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 COMPLETED: tuple[Format, ...] = ("ply", "glb")  # always written
 CLOUD_SIZE = 256  # pixels along each side of the pictures of a cloud's completion
-SMALL = 144  # pixels along each side of the pictures of other completions
+OTHERS_SIDE = 144  # pixels along each side of the pictures of other completions
 SPREAD = 0.1  # distance between completions that is drawn in the fullest colour
 
 
@@ -60,14 +60,14 @@ class Task:
         return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
 
     def surface(self, code: Float[Tensor, "length"]) -> "trimesh.Trimesh":
-        return completed(self.model.field(code), self.known, self.mesh)
+        return pruned_mesh(self.model.field(code), self.known, self.mesh)
 
     def shown(self, observation: View | Cloud) -> View:
         return observation.seen_from(self.camera) if isinstance(observation, Cloud) else observation
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CompletionResult:
     """The result of a fit, and of the fits of other completions."""
 
     fit: CodeFit
@@ -101,22 +101,22 @@ def complete(run: Run, task: Task) -> Verdict:
     return content.verdict
 
 
-def _outcome(task: Task, fit: CodeFit) -> Outcome:
+def _outcome(task: Task, fit: CodeFit) -> CompletionResult:
     """Returns the surface and the other completions. Raises `ValueError` for a field without a zero."""
     others: list[Tensor] = []
     evaluations = fit.evaluations
     if task.plausible:
         config = task.fit if isinstance(task.fit, CodeFitConfig) else CodeFitConfig(seed=task.fit.seed)
-        others, spent = plausible(task.model, task.known, task.plausible, config)
+        others, spent = posterior_codes(task.model, task.known, task.plausible, config)
         evaluations += spent
     mesh = task.surface(fit.code)
     if others and len(mesh.faces):
         vertices = torch.tensor(np.asarray(mesh.vertices), dtype=torch.float32, device=task.mesh.device)
-        mesh.vertex_attributes["spread"] = spread(task.model, others, vertices).cpu().numpy()
-    return Outcome(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
+        mesh.vertex_attributes["spread"] = posterior_deviation(task.model, others, vertices).cpu().numpy()
+    return CompletionResult(fit, others, mesh, None if task.truth is None else chamfer(mesh, task.truth), evaluations)
 
 
-def _page_content(task: Task, outcome: Outcome) -> report.Completion:
+def _page_content(task: Task, outcome: CompletionResult) -> report.Completion:
     """Returns everything that the page shows."""
     known = task.shown(task.known)
     full = task.shown(task.full)
@@ -126,10 +126,11 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
         camera = task.camera.to(task.mesh.device)
         before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
+    pruned = outcome.mesh.metadata.get(PRUNED_PIECES, 0)
     facts = {
         "points used": str(len(points)),
         "silhouette": "none" if known.mask is None else "used",
-        "pieces removed from the mesh, where the view shows free space": str(outcome.mesh.metadata.get(LEFT_OUT, 0)),
+        "pieces removed from the mesh, where the view shows free space": str(pruned),
         "iterations": str(task.fit.total),
         "starts": str(task.fit.starts),
         "evaluations of the network": f"{outcome.evaluations:,}",
@@ -160,17 +161,17 @@ def _page_content(task: Task, outcome: Outcome) -> report.Completion:
 
 
 @torch.no_grad()
-def _other_pictures(task: Task, outcome: Outcome) -> list[list[shading.Picture]]:
+def _other_pictures(task: Task, outcome: CompletionResult) -> list[list[shading.Picture]]:
     """Returns two rows, from the camera and from behind: the spread of all completions, then each other one."""
     camera = task.camera.to(task.mesh.device)
-    camera = camera.resized(SMALL / camera.height)
+    camera = camera.resized(OTHERS_SIDE / camera.height)
     model = task.model
     codes = outcome.others
     rows = []
     for eye in (camera, camera.turned(180.0)):
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
-        distance[buffers.mask] = spread(model, codes, buffers.points)
+        distance[buffers.mask] = posterior_deviation(model, codes, buffers.points)
         pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows

@@ -23,7 +23,7 @@ from rich.progress import (
 
 import distrace
 from distrace.cli import discard_output
-from distrace.errors import DoubtfulResult, explained
+from distrace.errors import DoubtfulResult, error_context
 from distrace.files import save_json
 from distrace.optional import MissingLibrary
 
@@ -121,7 +121,7 @@ def chosen_device(name: str) -> torch.device:
         name = "cuda" if torch.cuda.is_available() else "cpu"
     if name.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"--device {name} was given, but this machine or this build of PyTorch has no CUDA; use cpu")
-    with explained(f"--device {name} is no device; use auto, cpu or cuda"):
+    with error_context(f"--device {name} is no device; use auto, cpu or cuda"):
         device = torch.device(name)
     if device.type not in ("cpu", "cuda"):
         raise ValueError(f"--device {name} is not supported; use auto, cpu or cuda")

@@ -7,7 +7,8 @@ from pathlib import Path
 import tyro
 
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, GradientRow, check_gradients
-from distrace.cli.common import ModelName, Orbit, opened, show_table
+from distrace.checkpoints.codes import named_code
+from distrace.cli.common import CodeName, ModelName, Orbit, opened, show_table
 from distrace.cli.console import origin, start
 
 
@@ -20,7 +21,7 @@ class CheckGradients(Orbit):
 
     model: tyro.conf.Positional[ModelName]
     out: Path = Path("out/check-gradients")
-    code: int = 0  # number of the training shape
+    code: CodeName = "0"
     size: int = field(default=48, kw_only=True)  # pixels along each side
     device: str = "cpu"
 
@@ -28,7 +29,7 @@ class CheckGradients(Orbit):
         run = start(self.out, self.device)
         model = opened(self.model, run.device)
         camera = self.camera().to(run.device)
-        found = check_gradients(model.field(self.code), camera, size=self.size)
+        found = check_gradients(model.field(named_code(model, self.code)), camera, size=self.size)
         show_table([_line(row) for row in found.rows])
         tolerances = {"tolerance": found.precision.tolerance, "stray": STRAY, "footprint_tolerance": ROUGHLY}
         facts = {"agrees": found.agrees, "verdicts": found.verdicts(), **tolerances, "evaluations": found.evaluations}

@@ -5,8 +5,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-import torch
 import tyro
 
 from distrace.checkpoints.codes import save_code
@@ -16,7 +14,7 @@ from distrace.cli.console import console, progress, start
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.movie import save_gif
 from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, PhotoFit, PhotoStep, fit_photos
 from distrace.photos.judge import ViewAgreement, view_agreements
@@ -80,10 +78,8 @@ class Multiview:
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
-        save_cameras(
-            run.out / "transforms.json",
-            {view.name: found.placement.camera_to_world(view.camera) for view in found.views},
-        )
+        sources = [view.source for view in found.views if view.source is not None]
+        save_cameras(run.out / "transforms.json", {source.file: source.camera for source in sources})
         run.finish(
             {
                 "loss": last.loss,
@@ -109,10 +105,8 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> P
 
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> "trimesh.Trimesh":
     """Returns the mesh in the folder's world."""
-    mesh = extract_mesh(model.field(step.code), config)
-    mesh.apply_transform(step.place.T_world_object.cpu().numpy())
-    mesh.vertices = found.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
-    return mesh
+    mesh_unit = mesh_in_world(extract_mesh(model.field(step.code), config), step.place)
+    return mesh_in_world(mesh_unit, found.placement.similarity)
 
 
 def _described(found: Photographs) -> str:

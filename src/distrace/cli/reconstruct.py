@@ -12,7 +12,7 @@ from distrace.cli.console import Run, console, progress, start
 from distrace.cli.reconstructed import Reconstructed
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
-from distrace.files import alone, save_json
+from distrace.files import run_lock, save_json
 from distrace.mesh import MeshConfig
 from distrace.photos.visual_hull import MaskOverlap, mask_overlaps, visual_hull
 from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths
@@ -72,7 +72,7 @@ class Reconstruct:
             if each.is_outlier:
                 run.warn(_doubt(each))
         fitted_to, held_out = parted(found.views, self.held_out)
-        with alone(run.out):
+        with run_lock(run.out):
             state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
             found_shape = Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out)
             found_shape.save(run, resolved, self.format)

@@ -1,7 +1,7 @@
 """The results of `reconstruct`: mesh, page, film, figures and cameras."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from statistics import median
@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from distrace.camera import Camera
 from distrace.cli.common import Format, save_meshes
 from distrace.cli.console import Run, device_name
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photograph import Photograph
 from distrace.data.placement import Placement
 from distrace.files import save_text
-from distrace.mesh import MeshConfig
+from distrace.mesh import MeshConfig, mesh_in_world
 from distrace.movie import save_gif
 from distrace.pose import exp_se3
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
@@ -50,11 +51,10 @@ class Reconstructed:
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
-        mesh.vertices = self.placement.to_world(torch.from_numpy(np.asarray(mesh.vertices))).numpy()
-        save_meshes(run.out, mesh, formats)
+        save_meshes(run.out, mesh_in_world(mesh, self.placement.similarity), formats)
         rows = self._rows(held_out)
-        refined = {view.name: self.placement.camera_to_world(view.camera) for view in self._refined}
-        save_cameras(run.out / "transforms.json", refined)
+        files = [view.source.file for view in self.fitted_to if view.source is not None]
+        save_cameras(run.out / "transforms.json", dict(zip(files, self._refined_in_world, strict=True)))
         run.finish(
             {
                 "rows": rows,
@@ -72,7 +72,21 @@ class Reconstructed:
     @cached_property
     def _refined(self) -> list[Photograph]:
         """Returns the views that were fitted to, with their refined cameras."""
-        return [moved(*each) for each in zip(self.fitted_to, self.state.motions().detach().cpu(), strict=True)]
+        return self._moved(self.fitted_to)
+
+    @cached_property
+    def _refined_in_world(self) -> list[Camera]:
+        """Returns the refined cameras in the folder's world, from the cameras of the folder in double."""
+        exact = [
+            replace(view, camera=self.placement.camera_to_unit(view.source.camera))
+            for view in self.fitted_to
+            if view.source is not None
+        ]
+        return [self.placement.camera_to_world(view.camera) for view in self._moved(exact)]
+
+    def _moved(self, views: Sequence[Photograph]) -> list[Photograph]:
+        """Returns the views that were fitted to, each with its camera's motion."""
+        return [moved(*each) for each in zip(views, self.state.motions().detach().cpu(), strict=True)]
 
     @cached_property
     def _drifts(self) -> list[float]:
@@ -119,9 +133,9 @@ class Reconstructed:
         return {
             view.name: {
                 "pixels_moved": round(pixels, 3),
-                "T_world_camera": self.placement.camera_to_world(view.camera).T_world_camera.tolist(),
+                "T_world_camera": camera.T_world_camera.tolist(),
             }
-            for view, pixels in zip(self._refined, self._drifts, strict=True)
+            for view, camera, pixels in zip(self._refined, self._refined_in_world, self._drifts, strict=True)
         }
 
 

@@ -19,7 +19,7 @@ from distrace.files import save_text
 from distrace.fitting.fit_scan import ScanFit, ScanFitConfig, fit_scan
 from distrace.fitting.judge import Verdict
 from distrace.fitting.placement_network import PlacementNetwork
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -58,8 +58,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     place = fit.place.to("cpu")
     save_code(run.out, fit.code, place)
     save_scan(run.out / "scan.npz", task.scan)
-    mesh = extract_mesh(task.model.field(fit.code), task.mesh)
-    mesh.apply_transform(place.T_world_object.double().numpy())
+    mesh = mesh_in_world(extract_mesh(task.model.field(fit.code), task.mesh), place)
     save_meshes(run.out, mesh, task.formats)
     pictures = _pictures(task, fit, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))

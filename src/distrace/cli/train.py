@@ -15,17 +15,17 @@ from distrace.cli.common import NONE, Every, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
-from distrace.files import alone
+from distrace.files import run_lock
 from distrace.render import render
-from distrace.report.charts import save_course
+from distrace.report.charts import plot_history
 from distrace.report.completion_page import View
 from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
-from distrace.training.fine_tuning import Kept, dwelling
-from distrace.training.losses import COURSE
+from distrace.training.fine_tuning import Distillation, oversampled
+from distrace.training.losses import STEPS_PER_LOSS
 from distrace.training.trainer import Training, begin_with, faster_in_bfloat16
 from distrace.training.trainer import start as start_training
 from distrace.training.trainer import train as run_training
@@ -74,7 +74,7 @@ class Train:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
         run = start(self.out, self.device)
-        with alone(run.out), flushed_denormals(), run.noticing():
+        with run_lock(run.out), flushed_denormals(), run.noticing():
             self._train(run, saving)
 
     def _train(self, run: Run, saving: Every) -> None:
@@ -82,21 +82,21 @@ class Train:
         initial = None if self.begin_with is None else opened(self.begin_with, run.device)
         resumed = load_training(self.out, loaded.names, run.device)
         config = self._prolonged(*resumed) if resumed else self._fresh()
-        kept = self._kept(config, initial, loaded.names)
+        distillation = self._distillation(config, initial, loaded.names)
         if resumed:
             training = resumed[0]
-            if kept and kept.codes.shape != training.codes.shape:
+            if distillation and distillation.codes.shape != training.codes.shape:
                 raise ValueError(
                     f"the run in {self.out} has codes of another length than {self.begin_with}; give another --out"
                 )
             console.print(f"continuing from step {training.step} of {config.steps}")
         else:
-            training, config = self._initialised(loaded, config, initial, kept, run.device)
+            training, config = self._initialised(loaded, config, initial, distillation, run.device)
             save_training(self.out, training, config, loaded.names)  # timed choices stay when the run is continued
         if initial is not None and config.dwell > 1:
             console.print(f"finding samples whose sign {initial.name} has wrong")
-            loaded = dwelling(loaded, initial, config.dwell)
-        loss = _run(run, loaded, training, config, kept, saving)
+            loaded = oversampled(loaded, initial, config.dwell)
+        loss = _run(run, loaded, training, config, distillation, saving)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
@@ -120,7 +120,12 @@ class Train:
         return replace(self._changed(TrainConfig()), **_given(self, "samples_per_step", "seed"))
 
     def _initialised(
-        self, samples: Samples, config: TrainConfig, initial: Model | None, kept: Kept | None, device: torch.device
+        self,
+        samples: Samples,
+        config: TrainConfig,
+        initial: Model | None,
+        distillation: Distillation | None,
+        device: torch.device,
     ) -> tuple[Training, TrainConfig]:
         """Returns a run before its first step, and its configuration."""
         specs = self._specs(initial)
@@ -129,13 +134,13 @@ class Train:
         if initial is not None:
             begin_with(training, samples.names, initial)
         if self.minutes is not None:
-            config = _timed(self.minutes, samples, specs, config, kept, device)
+            config = _timed(self.minutes, samples, specs, config, distillation, device)
         return training, config
 
-    def _kept(self, config: TrainConfig, initial: Model | None, names: list[str]) -> Kept | None:
+    def _distillation(self, config: TrainConfig, initial: Model | None, names: list[str]) -> Distillation | None:
         """Returns the distillation's teacher, if any. Raises `ValueError` for options that lack --begin-with."""
         if initial is not None:
-            return Kept.of(initial, names) if config.keep else None
+            return Distillation.of(initial, names) if config.keep else None
         if config.dwell > 1 or config.keep:
             raise ValueError(f"the run in {self.out} uses --dwell or --keep; add --begin-with and the model")
         return None
@@ -171,22 +176,32 @@ def _given(command: Train, *names: str) -> dict[str, Any]:
 
 
 def _timed(
-    minutes: float, samples: Samples, specs: NetworkSpecs, config: TrainConfig, kept: Kept | None, device: torch.device
+    minutes: float,
+    samples: Samples,
+    specs: NetworkSpecs,
+    config: TrainConfig,
+    distillation: Distillation | None,
+    device: torch.device,
 ) -> TrainConfig:
     """Returns the configuration with the steps that fit into the time, by the median of a few trial steps."""
     trial = start_training(len(samples.names), specs, config, device)
-    steps = run_training(samples, trial, replace(config, steps=TRIAL_STEPS), kept)
+    steps = run_training(samples, trial, replace(config, steps=TRIAL_STEPS), distillation)
     seconds = median_high(step.seconds for step in steps)
     return replace(config, steps=max(int(minutes * 60 / seconds), TRIAL_STEPS))
 
 
 def _run(
-    run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None, saving: Every
+    run: Run,
+    samples: Samples,
+    training: Training,
+    config: TrainConfig,
+    distillation: Distillation | None,
+    saving: Every,
 ) -> float:
     """Trains to the last step and saves checkpoints; returns the mean loss of the last steps."""
     loss = training.losses[-1] if training.losses else math.nan
     with progress("training", config.steps) as bar:
-        for step in run_training(samples, training, config, kept):
+        for step in run_training(samples, training, config, distillation):
             if not math.isfinite(step.loss):
                 raise ValueError(
                     f"the training has diverged at step {step.step}; {run.out} has the last checkpoint; lower"
@@ -195,17 +210,21 @@ def _run(
             loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
             bar.advance(f"loss {loss:.5f}", to=step.step)
             if saving.passed():
-                _save(run, samples, training, config, kept)
-    _save(run, samples, training, config, kept)
+                _save(run, samples, training, config, distillation)
+    _save(run, samples, training, config, distillation)
     return loss
 
 
-def _save(run: Run, samples: Samples, training: Training, config: TrainConfig, kept: Kept | None) -> None:
+def _save(
+    run: Run, samples: Samples, training: Training, config: TrainConfig, distillation: Distillation | None
+) -> None:
     """Writes the checkpoint, the model in DeepSDF's layout, the loss history, and previews of a few shapes."""
     save_training(run.out, training, config, samples.names)
     with run.optional("losses.png"):
-        save_course(run.out / "losses.png", training.losses, COURSE, "steps", f"mean loss of {COURSE} steps")
-    others = kept.others if kept else {}
+        plot_history(
+            run.out / "losses.png", training.losses, STEPS_PER_LOSS, "steps", f"mean loss of {STEPS_PER_LOSS} steps"
+        )
+    others = distillation.others if distillation else {}
     codes = torch.stack([*training.codes.detach(), *others.values()])
     model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
     save_experiment(run.out, model.decoder, model.codes, model.shapes)

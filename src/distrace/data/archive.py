@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import IO, BinaryIO
 
-from distrace.errors import explained
+from distrace.errors import error_context
 
 LIMIT = 4 << 30  # bytes
 
@@ -24,7 +24,7 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
     Raises `ValueError` if `path` is not a whole .deb, or if one of them is neither file nor folder, would land
     outside `folder`, or brings the total above `limit` bytes; what was written before that stays.
     """
-    with explained(f"{path} cannot be unpacked as a Debian package; download the .deb again", path):
+    with error_context(f"{path} cannot be unpacked as a Debian package; download the .deb again", path):
         _check_file(path)
         with path.open("rb") as handle:
             packed = _data_tar(handle, path.stat().st_size)
@@ -36,7 +36,7 @@ def unpack_deb(path: Path, folder: Path, limit: int = LIMIT, below: Sequence[str
 
 def unpack_zip(path: Path, folder: Path, limit: int = LIMIT) -> None:
     """Writes the files of a zip under `folder`. Raises `ValueError` as `unpack_deb` does."""
-    with explained(f"{path} cannot be unpacked as a zip; download it again", path):
+    with error_context(f"{path} cannot be unpacked as a zip; download it again", path):
         _check_file(path)
         with zipfile.ZipFile(path) as archive:
             _write(_zip_members(archive), folder, limit)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.checks import check_intrinsics
-from distrace.errors import explained
+from distrace.errors import error_context
 
 NAMES = ("depth", "intrinsics", "T_world_camera", "mask", "normal")
 MAX_PIXELS = 8192 * 4096  # pixels
@@ -18,7 +18,7 @@ LENGTH_TOLERANCE = 1e-4  # by which a unit normal may be too long
 
 def read_arrays(path: Path) -> dict[str, np.ndarray]:
     """Those of NAMES that an `.npz` holds; nothing in it is unpickled. Raises `ValueError` for any other file."""
-    with explained(f"{path} is not an observation: an .npz with depth, intrinsics and T_world_camera", path):
+    with error_context(f"{path} is not an observation: an .npz with depth, intrinsics and T_world_camera", path):
         with np.load(path, allow_pickle=False) as archive:
             arrays = {name: archive[name] for name in NAMES if name in archive.files}
         return {name: arrays[name] for name in (*NAMES[:3], *arrays)}  # a KeyError names what is missing
@@ -42,7 +42,7 @@ def depth_image(array: np.ndarray) -> Float[Tensor, "height width"]:
 def camera_of(intrinsics: np.ndarray, pose: np.ndarray, height: int, width: int) -> Camera:
     """Raises `ValueError` where the matrices are no pinhole camera's of such an image."""
     matrices = _numbers("intrinsics", _flat(intrinsics, 2)), _numbers("T_world_camera", _flat(pose, 2))
-    with explained("no camera is described"):
+    with error_context("no camera is described"):
         camera = Camera.from_matrices(*matrices, height, width)
     if camera.intrinsics.dim() != 2:
         raise ValueError(f"{len(intrinsics)} cameras are described; one depth image has one")

@@ -15,7 +15,7 @@ from distrace.data.checks import MAX_MEDIAN_RADIUS
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
-from distrace.errors import DoubtfulResult, explained
+from distrace.errors import DoubtfulResult, error_context
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
 
 
 def _read(path: Path, advice: str) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"] | None]:
-    with explained(f"{path} cannot be read as a cloud of points; {advice}", path):
+    with error_context(f"{path} cannot be read as a cloud of points; {advice}", path):
         if path.suffix.lower() == ".pcd":
             columns = load_pcd(path)
             return np.stack([columns[axis] for axis in "xyz"], axis=1), None

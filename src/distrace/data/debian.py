@@ -11,7 +11,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from distrace.data.archive import unpack_deb
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.files import save_text
 
 STAMP = "unpacked-from.txt"
@@ -36,7 +36,7 @@ def listed(
 
     Raises `ValueError` if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
     """
-    with explained(f"{out} cannot be written to; choose another --out"):
+    with error_context(f"{out} cannot be written to; choose another --out"):
         out.mkdir(parents=True, exist_ok=True)
     meshes = catalogue(deb or fetch(package, out), out)
     write_catalogue(meshes, out / "shapes.csv")
@@ -49,7 +49,7 @@ def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
     writer = csv.writer(table, lineterminator="\n")
     writer.writerow(COLUMNS)
     writer.writerows((m.category, m.name, m.creator, m.licence, m.package, m.path.as_posix()) for m in meshes)
-    with explained(f"{path} cannot be written; choose another --out"):
+    with error_context(f"{path} cannot be written; choose another --out"):
         save_text(path, table.getvalue())
 
 
@@ -72,7 +72,10 @@ def fetch(package: str, folder: Path) -> Path:
     if present:
         return present[-1]
     # apt-get writes under the final name from the first byte: an interrupted file must not look whole.
-    with explained(f"apt-get cannot download {package}; {by_hand(package)}"), TemporaryDirectory(dir=folder) as partial:
+    with (
+        error_context(f"apt-get cannot download {package}; {by_hand(package)}"),
+        TemporaryDirectory(dir=folder) as partial,
+    ):
         command = ["apt-get", "download", package]
         done = subprocess.run(command, cwd=partial, stdin=subprocess.DEVNULL, capture_output=True, text=True)
         found = list(Path(partial).glob(pattern))

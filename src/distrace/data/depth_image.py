@@ -10,7 +10,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.arrays import camera_of, depth_image, mask_image
-from distrace.errors import about, explained
+from distrace.errors import about, error_context
 from distrace.optional import require
 from distrace.viewpoint import check_matrices
 
@@ -26,7 +26,7 @@ def load_depth_image(path: Path) -> Float[Tensor, "height width"]:
     Raises `ValueError`, in one sentence, for a file that holds no depths.
     """
     hint = "give a 16-bit PNG in millimetres, or an NPY or EXR in metres"
-    with explained(f"{path} cannot be read as a depth image: {hint}", path):
+    with error_context(f"{path} cannot be read as a depth image: {hint}", path):
         kind = path.suffix.lower()
         values = _exr(path) if kind == ".exr" else _array(path) if kind == ".npy" else _picture(path)
         depth = depth_image(values)
@@ -46,7 +46,7 @@ def load_intrinsics(text: str, height: int, width: int) -> Camera:
     Raises `ValueError` for anything else.
     """
     meant = "give fx,fy,cx,cy in pixels, or a file with a 3 × 3 matrix"
-    with explained(f"--intrinsics {text} was given; {meant}"):
+    with error_context(f"--intrinsics {text} was given; {meant}"):
         matrix = _matrix(text)
     with about(f"--intrinsics {text}"):
         return camera_of(matrix, np.eye(4), height, width)
@@ -57,7 +57,9 @@ def load_pose(path: Path) -> Float[Tensor, "4 4"]:
 
     Raises `ValueError`, in one sentence, for anything that is no rigid motion.
     """
-    with explained(f"{path} cannot be read as a pose: give the 4 × 4 matrix that maps its camera to the world", path):
+    with error_context(
+        f"{path} cannot be read as a pose: give the 4 × 4 matrix that maps its camera to the world", path
+    ):
         values = np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else _numbers_of(path.read_text())
         pose = torch.from_numpy(values.reshape(4, 4)).float()
     with about(path):
@@ -69,7 +71,7 @@ def load_mask(path: Path, height: int, width: int) -> Bool[Tensor, "height width
     """Returns where a picture is not black. Raises `ValueError` for one of another size, or with nothing marked."""
     from PIL import Image
 
-    with explained(f"{path} cannot be read as a mask: give a picture that is white where the object is", path):
+    with error_context(f"{path} cannot be read as a mask: give a picture that is white where the object is", path):
         with Image.open(path) as picture:
             values = np.asarray(picture.convert("L"))
     with about(path):

@@ -1,7 +1,8 @@
 """One photograph: its camera, its colours, and the object's mask."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float
@@ -13,6 +14,14 @@ MIN_COVERED = 1e-3  # pixels: what a last row or column covers at least, where t
 
 
 @dataclass(frozen=True)
+class Source:
+    """What a photograph was read from: the file of its image, and the camera in the folder's world, in double."""
+
+    file: Path
+    camera: Camera
+
+
+@dataclass(frozen=True)
 class Photograph:
     """Colours from 0 to 1 as stored (sRGB), in the pixels of the camera; the mask, if known, says what is object."""
 
@@ -20,10 +29,11 @@ class Photograph:
     camera: Camera
     image: Float[Tensor, "height width 3"]
     mask: Bool[Tensor, "height width"] | None = None
+    source: Source | None = None
 
     def to(self, device: torch.device | str) -> "Photograph":
         mask = None if self.mask is None else self.mask.to(device)
-        return Photograph(self.name, self.camera.to(device), self.image.to(device), mask)
+        return replace(self, camera=self.camera.to(device), image=self.image.to(device), mask=mask)
 
     @property
     def known_mask(self) -> Bool[Tensor, "height width"]:
@@ -48,7 +58,7 @@ class Photograph:
         camera = self.camera.resized(factor)
         image = averaged(self.image, factor).float()
         mask = None if self.mask is None else averaged(self.mask[..., None], factor)[..., 0] > 0.5
-        return Photograph(self.name, camera, image, mask)
+        return replace(self, camera=camera, image=image, mask=mask)
 
 
 def averaged(image: Tensor, factor: float) -> Float[Tensor, "height_ width_ channels"]:

@@ -11,8 +11,9 @@ from jaxtyping import Float
 from distrace.camera import Camera
 from distrace.data.checks import check_intrinsics
 from distrace.data.photo_readers import colmap, idr, middlebury, own, transforms
-from distrace.data.photo_readers.frames import Shot, inside
+from distrace.data.photo_readers.frames import Frame, inside
 from distrace.data.photograph import Photograph as Photograph
+from distrace.data.photograph import Source
 from distrace.data.pictures import read_mask, read_picture
 from distrace.data.placement import Placement as Placement
 from distrace.data.placement import among_points, between_axes
@@ -50,24 +51,24 @@ def load_photographs(folder: Path) -> Photographs:
     """
     if not folder.is_dir():
         raise ValueError(f"there is no folder {folder}")
-    shots = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
-    if shots is None:
+    frames = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
+    if frames is None:
         raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
-    if len(shots.views) < 2:
-        raise ValueError(f"{folder}: its {shots.layout} describes {len(shots.views)} views; at least two are needed")
-    names = _distinct([shot.image.stem for shot in shots.views])
-    views = [replace(_photograph(shot), name=name) for shot, name in zip(shots.views, names)]
+    if len(frames.views) < 2:
+        raise ValueError(f"{folder}: its {frames.layout} describes {len(frames.views)} views; at least two are needed")
+    names = _distinct([frame.image.stem for frame in frames.views])
+    views = [replace(_photograph(frame), name=name) for frame, name in zip(frames.views, names)]
     masks = [view.mask for view in views if view.mask is not None]
     with about(folder):
         if len(masks) == len(views) and not any(mask.any() for mask in masks):
             raise ValueError(f"its {len(masks)} masks mark no pixel as object; they are white where the object is")
-        placement = shots.placement or estimated(views, shots.points)
+        placement = frames.placement or estimated(views, frames.points)
     placed = []
     for view in views:
         camera = placement.camera_to_unit(view.camera)
         single = replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
         placed.append(replace(view, camera=single))
-    return Photographs(tuple(placed), placement, shots.layout, shots.placement is not None)
+    return Photographs(tuple(placed), placement, frames.layout, frames.placement is not None)
 
 
 def save_photographs(folder: Path, photographs: Photographs) -> None:
@@ -120,21 +121,21 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return list(names) if len(set(names)) == len(names) else [f"{k:03d}_{name}" for k, name in enumerate(names)]
 
 
-def _photograph(shot: Shot) -> Photograph:
-    with about(shot.field):
-        image, mask = read_picture(shot.image)
-        mask = mask if shot.mask is None else read_mask(shot.mask)
+def _photograph(frame: Frame) -> Photograph:
+    with about(frame.field):
+        image, mask = read_picture(frame.image)
+        mask = mask if frame.mask is None else read_mask(frame.mask)
         height, width = image.shape[:2]
-        if shot.size not in (None, (height, width)):
-            stated = f"{shot.size[0]} × {shot.size[1]}"
-            raise ValueError(f"{shot.image} has {height} × {width} pixels, and the camera's image {stated}")
+        if frame.size not in (None, (height, width)):
+            stated = f"{frame.size[0]} × {frame.size[1]}"
+            raise ValueError(f"{frame.image} has {height} × {width} pixels, and the camera's image {stated}")
         if mask is not None and mask.shape != image.shape[:2]:
             other = f"{mask.shape[0]} × {mask.shape[1]}"
-            raise ValueError(f"{shot.mask} has {other} pixels, and its image {shot.image.name} {height} × {width}")
-        matrices = torch.from_numpy(shot.intrinsics), torch.from_numpy(shot.T_world_camera)
+            raise ValueError(f"{frame.mask} has {other} pixels, and its image {frame.image.name} {height} × {width}")
+        matrices = torch.from_numpy(frame.intrinsics), torch.from_numpy(frame.T_world_camera)
         camera = Camera.from_matrices(*matrices, height, width)
         check_intrinsics(camera)
-    return Photograph(shot.image.stem, camera, image, mask)
+    return Photograph(frame.image.stem, camera, image, mask, Source(frame.image, camera))
 
 
 def _remarks(view: Photograph) -> list[str]:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from distrace.errors import explained
+from distrace.errors import error_context
 
 FORMATS = ("PNG", "JPEG")
 EIGHT_BIT = ("L", "LA", "RGB", "RGBA")
@@ -55,7 +55,7 @@ def picture_size(path: Path) -> tuple[int, int]:
     """Height and width in pixels, as stored; raises `ValueError` for a file that is no PNG or JPEG."""
     from PIL import Image
 
-    with explained(f"{path} cannot be read as a PNG or JPEG image", path):
+    with error_context(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             return file.height, file.width
 
@@ -63,7 +63,7 @@ def picture_size(path: Path) -> tuple[int, int]:
 def _levels(path: Path) -> Float[Tensor, "height width channels"]:
     from PIL import Image
 
-    with explained(f"{path} cannot be read as a PNG or JPEG image", path):
+    with error_context(f"{path} cannot be read as a PNG or JPEG image", path):
         with Image.open(path, formats=FORMATS) as file:
             full = 65535 if file.mode in SIXTEEN_BIT else 255
             if file.mode in (*EIGHT_BIT, *SIXTEEN_BIT):

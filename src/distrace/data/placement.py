@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
+from distrace.pose import Similarity
 
 MIN_POINTS = 20  # points that locate an object
 POINTS_INSIDE = 0.9  # of the points are within the sphere; the others are background and outliers
@@ -25,6 +26,11 @@ class Placement:
 
     centre: Float[Tensor, "3"]  # in double: worlds may lie far from their origin
     radius: float
+
+    @property
+    def similarity(self) -> Similarity:
+        """Of the unit sphere in the world, in double."""
+        return Similarity(torch.eye(3).double(), self.centre, torch.tensor(self.radius).double())
 
     def to_world(self, points: Float[Tensor, "*points 3"]) -> Float[Tensor, "*points 3"]:
         centre = self.centre.to(points.device)

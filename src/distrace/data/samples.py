@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from distrace.data.solid import Solid, first_met
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.metrics import surface_points
 
 NEAR_SHARE = 0.94  # the share of samples near the surface; the rest fills the unit sphere
@@ -92,5 +92,5 @@ def _in_ball(random: np.random.Generator, count: int) -> Float[np.ndarray, "coun
 def write_samples(path: Path, samples: Float[np.ndarray, "n 4"]) -> None:
     """DeepSDF's `.npz`, with `pos` and `neg` [n, 4]: what lies outside and what lies inside."""
     inside = samples[:, 3] < 0
-    with written(path) as part:
+    with atomic_write(path) as part:
         np.savez(part, pos=samples[~inside], neg=samples[inside])

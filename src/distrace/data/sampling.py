@@ -12,9 +12,9 @@ from distrace.data.augmentation import lopsided, warped
 from distrace.data.samples import Doubt, doubt, sample, write_samples
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, load_solid, turned
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.files import save_json
-from distrace.processes import each_done
+from distrace.processes import parallel_map
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def run(todo: list[Job], workers: int) -> Iterator[Doubt]:
     """
     reports = [_earlier(job) for job in todo]
     yield from (report for report in reports if report)
-    yield from each_done(run_one, [job for job, report in zip(todo, reports) if not report], workers)
+    yield from parallel_map(run_one, [job for job, report in zip(todo, reports) if not report], workers)
 
 
 def run_one(job: Job) -> Doubt:
@@ -100,7 +100,7 @@ def _write(job: Job, solid: Solid) -> None:
 def _earlier(job: Job) -> Doubt | None:
     if not job.report.exists() or not job.mesh.is_file():
         return None
-    with explained(f"{job.report} is not what `sample` leaves of a shape; remove it to sample the shape anew"):
+    with error_context(f"{job.report} is not what `sample` leaves of a shape; remove it to sample the shape anew"):
         content = json.loads(job.report.read_text())
         before = dict(content.pop("settings"))
         report = Doubt(**content)

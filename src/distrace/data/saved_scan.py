@@ -8,7 +8,7 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.scan import Scan
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.files import save_arrays
 from distrace.rays import Rays
 
@@ -35,7 +35,7 @@ def save_scan(path: str | Path, scan: Scan) -> None:
 def read_scan(path: str | Path) -> tuple[Scan, list[Camera]]:
     """Reads what `save_scan` wrote. Raises `ValueError` for any other file."""
     path = Path(path)
-    with explained(f"{path} is no scan that `complete` wrote", path):
+    with error_context(f"{path} is no scan that `complete` wrote", path):
         with np.load(path, allow_pickle=False) as file:
             content = {name: torch.from_numpy(file[name]) for name in file.files}
         noise, tilt = content["noise_and_tilt"].tolist()

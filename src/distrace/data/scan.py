@@ -9,9 +9,9 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
-from distrace.data.object_view import ObjectView, check_count, find_object
 from distrace.data.observation import View
 from distrace.data.points import noise_of, radius_of, thinned
+from distrace.data.segmented_view import SegmentedView, check_count, find_object
 from distrace.data.up import GIVEN_TILT, Up, rays_below
 from distrace.rays import Rays
 
@@ -86,7 +86,7 @@ def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up,
     return scan_of_object(find_object(scene, mask, up, isolate))
 
 
-def scan_of_object(found: ObjectView) -> Scan:
+def scan_of_object(found: SegmentedView) -> Scan:
     """Returns the points of an object in a depth image, and the rays about them."""
     scene = found.scene
     behind = found.is_behind()

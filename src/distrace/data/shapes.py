@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 
-from distrace.errors import about, explained
+from distrace.errors import about, error_context
 
 SIDES = ("train", "test", "out")
 MESH_SUFFIXES = (".obj", ".ply", ".stl", ".off", ".glb", ".ac")
@@ -38,12 +38,14 @@ def read_split(source: str | Path) -> list[Shape]:
     source = Path(source)
     if not source.is_file():
         raise ValueError(f"there is no split {source}; give a CSV file with the columns {', '.join(COLUMNS)}")
-    with explained(f"the split {source} cannot be read as a CSV file"):
+    with error_context(f"the split {source} cannot be read as a CSV file"):
         rows = csv.DictReader(source.read_text(encoding="utf-8").splitlines())
         missing = [column for column in COLUMNS if column not in (rows.fieldnames or [])]
     if missing:
         raise ValueError(f"the split {source} lacks the columns {', '.join(missing)}")
-    with explained(f"the split {source} cannot be read: each row needs all of its columns, and degrees as its turn"):
+    with error_context(
+        f"the split {source} cannot be read: each row needs all of its columns, and degrees as its turn"
+    ):
         shapes = [_shape(row) for row in rows]
     with about(f"the split {source}"):
         return _checked_names(shapes)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from distrace.data.mesh_files import load_soup
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.optional import require
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def load_solid(path: Path) -> Solid:
 
     Raises `ValueError` for a file that cannot be read, or that bounds nothing.
     """
-    with explained(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file", path):
+    with error_context(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file", path):
         soup = oriented(normalised(load_soup(path)))
     surface = outer_surface(soup)
     if surface.area < 0.05 * soup.area:

@@ -42,6 +42,18 @@ def check_field(field: object) -> None:
         raise TypeError(f"a {kind} was given where a field is needed; give a function from points to distances")
 
 
+def clamped_to_ball(points: Float[Tensor, "*batch 3"]) -> tuple[Float[Tensor, "*batch 3"], Float[Tensor, "*batch"]]:
+    """Returns the nearest points of the unit ball, and the distances to them.
+
+    A decoder is not trained beyond the ball; there its value at the nearest point plus the distance stands for it.
+
+    >>> clamped_to_ball(torch.tensor([0.0, 0.0, 3.0]))
+    (tensor([0., 0., 1.]), tensor(2.))
+    """
+    length = points.norm(dim=-1).clamp_min(1.0)
+    return points / length[..., None], length - 1
+
+
 def value_and_gradient(
     sdf: SDF, points: Float[Tensor, "*batch 3"], *, second_order: bool = True
 ) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch 3"]]:

@@ -10,7 +10,7 @@ from torch.nn.functional import normalize
 from distrace.camera import Camera
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fitting.solver import Residuals
-from distrace.fitting.visibility import Sight
+from distrace.fitting.visibility import ObservedRays
 from distrace.pose import object_in_camera
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.surface import minimum
@@ -18,10 +18,10 @@ from distrace.tracing.bounds import Occupancy
 from distrace.tracing.sphere_tracing import Trace
 from distrace.tracing.tracer import TracerConfig, trace_rays
 
-APART = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
+CURVATURE_STEP = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
 CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
 REACH = 0.05  # for the least value on a ray: then to a fifth of that, and to a fifth of that
-CLOSE = 3e-4  # enough for a step of the solver
+TRACE_TOLERANCE = 3e-4  # enough for a step of the solver
 
 
 @dataclass(frozen=True)
@@ -47,41 +47,41 @@ class Still:
 
     def trace(self, rays: Rays) -> Trace:
         """Where rays hit the shape; `closest`, of those that miss the unit sphere, is where they come nearest to it."""
-        trace, _ = trace_rays(self.sdf, rays, config=TracerConfig(tolerance=CLOSE), occupancy=self.occupancy)
+        trace, _ = trace_rays(self.sdf, rays, config=TracerConfig(tolerance=TRACE_TOLERANCE), occupancy=self.occupancy)
         nearest = -(rays.origins * rays.directions).sum(-1).clamp_max(0)
         return replace(trace, closest=torch.where(trace.closest.isfinite(), trace.closest, nearest))
 
 
 @torch.no_grad()
-def residuals(shape: Still, sight: Sight, camera: Camera, accuracy: Accuracy, *, focal: bool) -> Residuals:
+def residuals(shape: Still, observed: ObservedRays, camera: Camera, accuracy: Accuracy, *, focal: bool) -> Residuals:
     """Of all rays that disagree, by how the shape turns and shifts before the camera (and the log of its focal length).
 
     A depth is off by (z − z_observed) · |∇f · v|: how far the surface is from the observed point. A ray that should hit
     is off by the least value of f on it. One that should miss is off by as far as its hit lies from the object that was
     observed, across the view; where the outline itself is on the ray, by the least value, closely, too.
     """
-    rays, cosines = camera.rays(sight.pixels), camera.cosines(sight.pixels)
+    rays, cosines = camera.rays(observed.pixels), camera.cosines(observed.pixels)
     bounds = meet_sphere(rays)
     trace = shape.trace(rays)
-    beyond = sight.is_background & trace.hit & (sight.outside.norm(dim=-1) > 0)
-    lacking = torch.where(trace.hit, sight.is_background & ~beyond, sight.is_object)
+    beyond = observed.is_background & trace.hit & (observed.outside.norm(dim=-1) > 0)
+    lacking = torch.where(trace.hit, observed.is_background & ~beyond, observed.is_object)
     astray = lacking & ~bounds.meets
-    seen = trace.hit & ~sight.is_background
+    seen = trace.hit & ~observed.is_background
     t = torch.where(trace.hit, trace.distance, trace.closest)
-    low = lacking & sight.is_object & sight.is_background & bounds.meets  # others need not be known so closely
+    low = lacking & observed.is_object & observed.is_background & bounds.meets  # others need not be known so closely
     some = Bounds(bounds.near[low], bounds.far[low])
     t[low] = minimum(shape.sdf, rays[low], t[low], some, reach=REACH, refine=2)
     rows = (lacking | beyond | seen).nonzero()[:, 0]
     here = _Here.of(shape.sdf, camera, rays[rows], t[rows], astray[rows], focal=focal)
-    off = (t * cosines - sight.depth)[rows] * here.slope / cosines[rows]
+    off = (t * cosines - observed.depth)[rows] * here.slope / cosines[rows]
     parts = [
         here.part(here.value, lacking[rows], accuracy.outline),
-        here.part(off, (seen & sight.depth.isfinite())[rows], accuracy.depth),
-        here.across(sight.outside[rows], beyond[rows], camera, accuracy.outline),
-        here.normals(shape.sdf, sight.normal[rows], (seen & sight.has_normal)[rows], accuracy.normal),
+        here.part(off, (seen & observed.depth.isfinite())[rows], accuracy.depth),
+        here.across(observed.outside[rows], beyond[rows], camera, accuracy.outline),
+        here.normals(shape.sdf, observed.normal[rows], (seen & observed.has_normal)[rows], accuracy.normal),
     ]
     values, jacobian = (torch.cat(part) for part in zip(*parts))
-    weights = torch.full_like(values, 1 / len(sight.pixels))
+    weights = torch.full_like(values, 1 / len(observed.pixels))
     weights[len(values) - len(parts[-1][0]) :] /= 3  # of a normal's three parts
     return Residuals(values, jacobian, weights)
 
@@ -134,18 +134,20 @@ class _Here:
     def normals(self, sdf: SDF, observed: Tensor, where: Bool[Tensor, "n"], scale: float) -> tuple[Tensor, Tensor]:
         """Differences of normals in the camera's axes; they turn with the shape, and as the hit slides over its bends.
 
-        Bends are differences over APART: a ReLU network has none but at its facets' edges.
+        Bends are differences over CURVATURE_STEP: a ReLU network has none but at its facets' edges.
         """
         normal, ray = normalize(self.gradient[where], dim=-1), self.directions[where]
         side = normalize(torch.linalg.cross(normal, normal.roll(1, -1) + 0.1), dim=-1)
         tangents = torch.stack([side, torch.linalg.cross(normal, side)], dim=1)
-        _, around = value_and_gradient(sdf, self.points[where, None] + APART * torch.cat([tangents, -tangents], dim=1))
+        _, around = value_and_gradient(
+            sdf, self.points[where, None] + CURVATURE_STEP * torch.cat([tangents, -tangents], dim=1)
+        )
         ahead, behind = normalize(around, dim=-1).split(2, dim=1)
         motion = -torch.einsum("kj,nku->nju", self.rotation, self.motion[where])  # of a fixed point over the shape
         along = torch.einsum("nj,nju->nu", normal, motion) / (normal * ray).sum(-1).clamp_max(-0.05)[:, None]
         slid = torch.einsum("nsj,nju->nsu", tangents, motion - ray[:, :, None] * along[:, None])
-        bent = torch.einsum("nsj,nsu->nju", (ahead - behind) / (2 * APART), slid)
-        change = torch.einsum("ij,nju->niu", self.rotation, bent)
+        curvature = torch.einsum("nsj,nsu->nju", (ahead - behind) / (2 * CURVATURE_STEP), slid)
+        change = torch.einsum("ij,nju->niu", self.rotation, curvature)
         seen = normal @ self.rotation.T
         change[:, :, :3] += _crossed(torch.eye(3).to(seen).expand(len(seen), 3, 3), seen)
         return ((seen - observed[where]) / scale).flatten(), (change / scale).flatten(0, 1)

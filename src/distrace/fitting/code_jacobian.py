@@ -7,7 +7,7 @@ from torch import Tensor
 from distrace.fields.decoder import RECORDED_CHUNK, Decoder
 from distrace.fields.precision import BFloat16Decoder, PackedDecoder
 
-SMALL = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
+PRIOR_SCALE = 1e-6  # × a code's coordinate is its residual: far below any scale, where the loss is a square
 PART = RECORDED_CHUNK // 2  # rows of a Jacobian that are made at once
 
 

@@ -60,7 +60,7 @@ def signed_samples(points: Float[Tensor, "n 3"], normals: Float[Tensor, "n 3"], 
     return torch.cat([points + offset * normals, torch.full_like(points[:, :1], offset)], dim=1)
 
 
-def plausible(
+def posterior_codes(
     model: Model, seen: View | Cloud, count: int, config: CodeFitConfig = CodeFitConfig()
 ) -> tuple[list[Float[Tensor, "length"]], int]:
     """Returns the codes of `count` completions, best first, and the number of evaluations."""
@@ -69,7 +69,9 @@ def plausible(
 
 
 @torch.no_grad()
-def spread(model: Model, codes: Sequence[Float[Tensor, "length"]], points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+def posterior_deviation(
+    model: Model, codes: Sequence[Float[Tensor, "length"]], points: Float[Tensor, "n 3"]
+) -> Float[Tensor, "n"]:
     """How far the surfaces of codes are from each point: the root of the mean squared distance, at most `FAR`."""
     distances = torch.stack([model.field(code)(points).clamp(-FAR, FAR) for code in codes])
     return distances.square().mean(0).sqrt()

@@ -14,15 +14,15 @@ from distrace.fields.base import SDF, Counted
 from distrace.fitting.alignment import Accuracy, Still, residuals
 from distrace.fitting.blurred import Blurred
 from distrace.fitting.solver import Residuals, Solution, SolverConfig, minimise
-from distrace.fitting.visibility import Sight, outline_of, rays_of
+from distrace.fitting.visibility import ObservedRays, outline_of, rays_of
 from distrace.pose import aimed, pose_error, turned_object, zoomed
 from distrace.rays import meet_sphere
 
 AGREES = 0.03  # a start is good once no larger share of its rays is off by more than the accuracy …
-MOSTLY = 0.2  # … or no larger one than that, where another start ends at the same camera …
+AGREES_IF_REPEATED = 0.2  # … or no larger one than that, where another start ends at the same camera …
 SAME = 1.0  # … to so many degrees, and percent of the distance
 AXES = ((0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0), (0, 0, 1), (0, 0, -1))  # about which further starts are turned
-FRUITLESS = len(AXES)  # so many further starts that agree on no more rays are the last
+STARTS_WITHOUT_GAIN = len(AXES)  # so many further starts that agree on no more rays are the last
 PATIENCE, PROGRESS = 5, 0.8  # a start whose loss falls by less in so many iterations is given up
 
 BLURS = (2.5, 1.2)  # pixels of a coarse grid
@@ -132,7 +132,7 @@ class _Search:
         ):
             yield self.step(best.start, found)
 
-    def off(self, camera: Camera, rays: Sight | None = None) -> Residuals:
+    def off(self, camera: Camera, rays: ObservedRays | None = None) -> Residuals:
         return residuals(self.shape, rays or self.rays, camera, self.config.accuracy, focal=self.config.focal)
 
     def step(self, start: int, found: Solution[Camera]) -> CameraStep:
@@ -148,7 +148,11 @@ def _settled(ends: list[CameraStep]) -> bool:
     """Whether further starts are not worth their time: the best agrees, or is found again, or long not bettered."""
     best = min(ends, key=_off)
     again = [end for end in ends if max(pose_error(end.camera, best.camera)) < SAME]
-    return best.off < AGREES or (best.off < MOSTLY and len(again) > 1) or len(ends) - 1 - best.start >= FRUITLESS
+    return (
+        best.off < AGREES
+        or (best.off < AGREES_IF_REPEATED and len(again) > 1)
+        or len(ends) - 1 - best.start >= STARTS_WITHOUT_GAIN
+    )
 
 
 def _shifts(found: Residuals) -> Residuals:

@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     import trimesh
 
 MARGIN = 0.03  # of the unit sphere's radius: what is nearer to what was seen does not contradict it
-LEFT_OUT = "left_out"
+PRUNED_PIECES = "left_out"
 
 
-def completed(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> "trimesh.Trimesh":
+def pruned_mesh(sdf: SDF, seen: View | Cloud, config: MeshConfig) -> "trimesh.Trimesh":
     """The surface of a fitted field, less what the view contradicts; a cloud contradicts nothing.
 
     Raises `ValueError` where the field has no zero.
     """
     mesh = extract_mesh(sdf, config)
-    return consistent(mesh, seen) if isinstance(seen, View) else mesh
+    return prune_pieces(mesh, seen) if isinstance(seen, View) else mesh
 
 
-def consistent(mesh: "trimesh.Trimesh", view: View) -> "trimesh.Trimesh":
+def prune_pieces(mesh: "trimesh.Trimesh", view: View) -> "trimesh.Trimesh":
     """The mesh without pieces, connected to nothing else, most of whose area lies where the view shows free space.
 
     The largest piece stays in any case. How many are gone is in the metadata, by the name `left_out`.
@@ -44,7 +44,7 @@ def consistent(mesh: "trimesh.Trimesh", view: View) -> "trimesh.Trimesh":
     found = mesh.copy()
     found.update_faces(kept[pieces])
     found.remove_unreferenced_vertices()
-    found.metadata[LEFT_OUT] = int((~kept).sum())
+    found.metadata[PRUNED_PIECES] = int((~kept).sum())
     return found
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.data.scan import Scan
-from distrace.fields.base import SDF
+from distrace.fields.base import SDF, clamped_to_ball
 from distrace.pose import Similarity
 from distrace.rays import Bounds, meet_sphere
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
@@ -59,7 +59,7 @@ def judged(
     silhouette: float | None = None,
 ) -> Verdict:
     """Returns the verdict on a placed shape; `others` are the placed shapes of fits that are nearly as good."""
-    surface = surface_points(sdf, SURFACE_POINTS, scan.points)
+    surface = points_on_zero_set(sdf, SURFACE_POINTS, scan.points)
     disagreement = disagreement_of(place.to_world(surface), place, others)
     reach = _reach(surface)
     noise = 2 * min(scan.noise / float(place.scale), MOST_NOISE * reach)
@@ -121,9 +121,8 @@ def _reach(surface: Float[Tensor, "m 3"]) -> float:
 
 def distances(points: Float[Tensor, "n 3"], sdf: SDF, place: Similarity) -> Float[Tensor, "n"]:
     """How far points of the scan's frame are from the surface, in radii of the unit sphere."""
-    points = place.to_object(points)
-    length = points.norm(dim=-1).clamp_min(1.0)
-    return (sdf(points / length[:, None]) + length - 1).abs()
+    within, beyond = clamped_to_ball(place.to_object(points))
+    return (sdf(within) + beyond).abs()
 
 
 @torch.no_grad()
@@ -136,7 +135,7 @@ def disagreement_of(
 
 
 @torch.no_grad()
-def surface_points(sdf: SDF, count: int, like: Tensor, seed: int = 0) -> Float[Tensor, "n 3"]:
+def points_on_zero_set(sdf: SDF, count: int, like: Tensor, seed: int = 0) -> Float[Tensor, "n 3"]:
     """Returns points on a surface in the unit sphere, by Newton steps from points about it; some fall off."""
     random = torch.Generator().manual_seed(seed)
     points = torch.rand(20 * count, 3, generator=random).to(like) * 2 - 1

@@ -18,7 +18,7 @@ from torch.nn.functional import normalize
 
 from distrace.checkpoints.model import model_folder
 from distrace.data.scan import Scan
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.pose import Similarity
 from distrace.rays import Rays
 
@@ -210,7 +210,7 @@ def load_placement_network(model: str | Path) -> PlacementNetwork | None:
     if not path.is_file():
         return None
     network = PlacementNetwork()
-    with explained(f"{path} is not a safetensors file of a placement network", path):
+    with error_context(f"{path} is not a safetensors file of a placement network", path):
         network.load_state_dict(safetensors.torch.load_file(path))  # copies half precision into single
         if not all(tensor.isfinite().all() for tensor in network.state_dict().values()):
             raise ValueError("it has values that are not finite")

@@ -5,15 +5,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from distrace.data.scan import Scan
-from distrace.fields.base import SDF
+from distrace.fields.base import SDF, clamped_to_ball
 from distrace.fields.batch import BatchField, Selection
 from distrace.fields.decoder import FAR, Decoder
 from distrace.fields.precision import BFloat16Decoder
-from distrace.fitting.code_jacobian import SMALL, derivatives
+from distrace.fitting.code_jacobian import PRIOR_SCALE, derivatives
 from distrace.fitting.ray_sampling import drawn
 from distrace.fitting.solver import Residuals
 from distrace.pose import Similarity
@@ -178,9 +178,9 @@ class ScanProblem:
             jacobian[:count][far] = 0.0
         beliefs, by_unknowns = self._beliefs(state)
         return Residuals(
-            torch.cat([off, SMALL * beliefs]),
-            torch.cat([jacobian, SMALL * by_unknowns]),
-            torch.cat([weights, torch.full_like(beliefs, SMALL**-2)]),
+            torch.cat([off, PRIOR_SCALE * beliefs]),
+            torch.cat([jacobian, PRIOR_SCALE * by_unknowns]),
+            torch.cat([weights, torch.full_like(beliefs, PRIOR_SCALE**-2)]),
         )
 
     def _beliefs(self, state: PlacedCode) -> tuple[Tensor, Tensor]:
@@ -210,16 +210,11 @@ class ScanProblem:
 def extended(
     decoder: Decoder | BFloat16Decoder, points: Float[Tensor, "n 3"], code: Float[Tensor, "length"]
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n 3"], Float[Tensor, "n length"]]:
-    """Returns values and their derivatives; beyond the unit sphere, the value at the sphere and the distance to it.
-
-    A decoder is not trained beyond the sphere.
-    """
-    length = points.norm(dim=-1, keepdim=True).clamp_min(1.0)
-    within = points / length
+    """Returns values and their derivatives by points and code, continued beyond the unit ball as `clamped_to_ball`."""
+    within, beyond = clamped_to_ball(points)
     values, gradient, by_code = derivatives(decoder, within, code)
-    beyond: Bool[Tensor, "n 1"] = length > 1
-    across = (gradient - (gradient * within).sum(-1, keepdim=True) * within) / length + within
-    return values + (length - 1)[:, 0], torch.where(beyond, across, gradient), by_code
+    across = (gradient - (gradient * within).sum(-1, keepdim=True) * within) / (1 + beyond[:, None]) + within
+    return values + beyond, torch.where(beyond[:, None] > 0, across, gradient), by_code
 
 
 def _least(field: SDF, rays: Rays, t: Float[Tensor, "samples n"]) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:

@@ -11,7 +11,7 @@ from distrace.fitting.ray_sampling import band, drawn, middles
 
 
 @dataclass(frozen=True)
-class Sight:
+class ObservedRays:
     """A depth is `inf` and a normal zero where unknown. A ray of object and background both touches the shape."""
 
     pixels: Float[Tensor, "n 2"]
@@ -25,11 +25,13 @@ class Sight:
     def has_normal(self) -> Bool[Tensor, "n"]:
         return self.normal.norm(dim=-1) > 0.5
 
-    def __add__(self, other: "Sight") -> "Sight":
-        return Sight(*(torch.cat([getattr(self, part.name), getattr(other, part.name)]) for part in fields(self)))
+    def __add__(self, other: "ObservedRays") -> "ObservedRays":
+        return ObservedRays(
+            *(torch.cat([getattr(self, part.name), getattr(other, part.name)]) for part in fields(self))
+        )
 
 
-def rays_of(view: View, count: int, seed: int = 0) -> Sight:
+def rays_of(view: View, count: int, seed: int = 0) -> ObservedRays:
     """A third of the rays each on the object, beside its outline and around it; without a mask all on the object.
 
     Raises `ValueError` where nothing was observed.
@@ -43,7 +45,7 @@ def rays_of(view: View, count: int, seed: int = 0) -> Sight:
     pixels = [region.reshape(-1).nonzero()[:, 0] for region in regions]
     chosen = torch.cat([drawn(some, count // len(regions), random) for some in pixels])
     is_object = inside.reshape(-1)[chosen]
-    return Sight(
+    return ObservedRays(
         view.camera.pixels().reshape(-1, 2)[chosen],
         view.depth.reshape(-1)[chosen],
         is_object,
@@ -53,14 +55,16 @@ def rays_of(view: View, count: int, seed: int = 0) -> Sight:
     )
 
 
-def outline_of(mask: Bool[Tensor, "height width"], centres: Float[Tensor, "height width 2"], count: int) -> Sight:
+def outline_of(
+    mask: Bool[Tensor, "height width"], centres: Float[Tensor, "height width 2"], count: int
+) -> ObservedRays:
     """Rays between pixels of the object and of the background beside them: there the outline is, to half a pixel.
 
     At most `count`, drawn at random.
     """
     pixels = drawn(middles(mask, centres), count, torch.Generator().manual_seed(0))
     every, nothing = torch.ones_like(pixels[:, 0], dtype=torch.bool), pixels.new_zeros(len(pixels), 3)
-    return Sight(pixels, torch.full_like(pixels[:, 0], torch.inf), every, every, nothing, nothing[:, :2])
+    return ObservedRays(pixels, torch.full_like(pixels[:, 0], torch.inf), every, every, nothing, nothing[:, :2])
 
 
 def _outside(inside: Bool[Tensor, "height width"]) -> Float[Tensor, "height width 2"]:

@@ -64,6 +64,12 @@ class PhotoSet:
         return [photograph.camera for photograph in self.photographs]
 
     @cached_property
+    def masks(self) -> Masks | None:
+        """The masks, where every photograph has one: then nothing need be segmented."""
+        masks = [each.mask for each in self.photographs if each.mask is not None]
+        return masks if len(masks) == len(self.photographs) else None
+
+    @cached_property
     def images(self) -> list[GradientImage]:
         """The colours that are compared."""
         light = (lambda image: image) if self.config.same_light else normalise_light
@@ -135,6 +141,8 @@ class PhotoSet:
 
         Pixels that look like the object where most other views rule it out are unknown.
         """
+        if self.masks is not None:
+            return [2.0 * mask - 1 for mask in self.masks]
         hit = sample.trace.hit
         seen = sample.read(self.appearances)
         outside = [looks[~meets] for looks, meets in zip(self.appearances, self.meets, strict=True)]
@@ -152,6 +160,8 @@ class PhotoSet:
 
     def object_masks(self) -> Masks:
         """The masks or, without them, the pixels whose appearance is rare where rays miss the unit sphere."""
+        if self.masks is not None:
+            return self.masks
         model = ColourModel.of(
             torch.cat([looks.flatten(0, 1) for looks in self.appearances]),
             torch.cat([meets.flatten() for meets in self.meets]),

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from distrace.fields.base import Counted
 from distrace.fields.decoder import Decoder
-from distrace.fitting.code_jacobian import SMALL, derivatives
+from distrace.fitting.code_jacobian import PRIOR_SCALE, derivatives
 from distrace.fitting.solver import Residuals, charbonnier
 from distrace.photos.stereo_pairs import GradientImage
 from distrace.pose import Similarity
@@ -197,7 +197,7 @@ class PhotoProblem:
         weights = torch.cat(
             [torch.full_like(w, config.code_weight / len(w)), torch.full_like(place, config.place_weight)]
         )
-        return Residuals(SMALL * torch.cat([w, place]), SMALL * jacobian, 2 * weights / SMALL**2)
+        return Residuals(PRIOR_SCALE * torch.cat([w, place]), PRIOR_SCALE * jacobian, 2 * weights / PRIOR_SCALE**2)
 
 
 @dataclass(frozen=True)

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.photograph import Photograph
-from distrace.errors import explained
-from distrace.files import written
+from distrace.errors import error_context
+from distrace.files import atomic_write
 from distrace.pose import exp_se3
 from distrace.reconstruction.networks import ColourNetwork, SurfaceNetwork, SurfaceSpecs
 
@@ -144,7 +144,7 @@ def save_reconstruction(
         **{name: getattr(state, name) for name in NUMBERS},
         **{name: getattr(state, name).state_dict() for name in MODULES},
     }
-    with written(folder / NAME) as file:
+    with atomic_write(folder / NAME) as file:
         torch.save(content, file)
 
 
@@ -159,7 +159,7 @@ def load_reconstruction(
     path = folder / NAME
     if not path.exists():
         return state
-    with explained(f"{path} is not a checkpoint of a reconstruction; move it away to start afresh"):
+    with error_context(f"{path} is not a checkpoint of a reconstruction; move it away to start afresh"):
         content = torch.load(path, map_location=device, weights_only=True)
         settings = _settings(config, specs, fingerprints)
         changed = [name for name, value in settings.items() if content["settings"].get(name) != value]

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.optional import require
 from distrace.report.page import Html, paragraph, section
 
@@ -48,34 +48,23 @@ def starts_section(losses: Mapping[str, Sequence[float]], chosen: str | None) ->
     return section("Loss", paragraph(about), drawn)
 
 
-def save_course(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
+def plot_history(path: Path, values: Sequence[float], every: int, x_label: str, y_label: str) -> None:
     """Writes a PNG of values, one for `every` steps each, on logarithmic axes."""
     chart, axes = blank_chart("both")
     axes.plot(range(every, every * len(values) + 1, every), values, color=PALETTE[0])
     axes.set(xlabel=x_label, ylabel=y_label, xscale="log", yscale="log")
-    with written(path) as file:
+    with atomic_write(path) as file:
         chart.savefig(file, format="png", dpi=110, facecolor="white")
 
 
-def bars(values: Mapping[str, float], x_label: str) -> Html:
-    """Returns one bar for each name, the first on top, on a logarithmic axis, with its value."""
-    chart, axes = blank_chart("x", height=0.42 * len(values) + 0.9)
-    names = [plain(name) for name in values]
-    drawn = axes.barh(names, list(values.values()), color=PALETTE[0], height=0.62)
-    axes.bar_label(drawn, [f" {value:,.3g}" if value < 1000 else f" {value:,.0f}" for value in values.values()])
-    axes.set(xlabel=x_label, xscale="log", xlim=(min(values.values()) / 2, max(values.values()) * 4))
-    axes.invert_yaxis()
-    return as_html(chart)
-
-
-def blank_chart(grid: str, height: float = 3.6) -> "tuple[Figure, Axes]":
+def blank_chart(grid: str) -> "tuple[Figure, Axes]":
     """Returns a chart without curves; `grid` is the axis of its grid: x, y or both."""
     require("a chart", "matplotlib")
     from matplotlib import rc_context
     from matplotlib.figure import Figure
 
     with rc_context(STYLE):
-        chart = Figure(figsize=(7.4, height), layout="constrained", facecolor="none")
+        chart = Figure(figsize=(7.4, 3.6), layout="constrained", facecolor="none")
         axes = chart.add_subplot(facecolor="none")
         axes.spines[["top", "right"]].set_visible(False)
         axes.grid(axis=grid, color=THEME_INK, alpha=0.12, linewidth=0.6)  # pyright: ignore[reportArgumentType]

@@ -21,7 +21,7 @@ from distrace.report.charts import curves
 from distrace.report.page import Html, facts_section, figure, page, paragraph, section
 from distrace.report.scene import space_section
 from distrace.shading import Picture, colour_picture, mask_comparison, normal_picture, side_by_side
-from distrace.training.losses import COURSE
+from distrace.training.losses import STEPS_PER_LOSS
 
 if TYPE_CHECKING:
     import trimesh
@@ -110,7 +110,7 @@ def reconstruction_page(
     name: str,
     held_out: Sequence[Judged],
     fitted_to: Sequence[Judged],
-    course: Mapping[str, Sequence[float]],
+    loss_history: Mapping[str, Sequence[float]],
     mesh: "trimesh.Trimesh",
     facts: Mapping[str, str],
 ) -> str:
@@ -123,7 +123,7 @@ def reconstruction_page(
             *([section("Held-out views", paragraph(about), *map(_shown, held_out))] if held_out else []),
             section("Views that were fitted to", *map(_shown, fitted_to)),
             space_section({"Surface": mesh}),
-            section("Loss", curves(course, f"× {COURSE} steps", "mean of a term", True)),
+            section("Loss", curves(loss_history, f"× {STEPS_PER_LOSS} steps", "mean of a term", True)),
             facts_section(facts),
         ],
     )

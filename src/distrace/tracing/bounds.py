@@ -18,11 +18,11 @@ from distrace.tracing.images import Lines
 CELLS = 16  # along the diameter of the unit sphere; those that may hold surface are split once
 CORNERS = tuple(itertools.product((-1, 1), repeat=3))  # of a cell; also the offsets of its eight parts
 HALF_DIAGONAL = 3**0.5 / 2  # of a cell of width 1
-MARGIN = 1.1  # × the steepest measured slope: slopes between the samples may be larger
+MARGIN = 1.1  # × the largest measured slope: slopes between the samples may be larger
 SAMPLES = 4 * CELLS  # of the cells along a ray through the sphere: half a cell apart
 PROBES = 256  # cells nearest to the surface in which the gradient is measured
 STEEP = 0.97  # share of these gradients that the bound covers: ReLU networks have a few steep facets
-FLAT = 0.01  # of the steepest gradient, and of the least value per radius: flatter fields are saturated
+FLAT = 0.01  # of the largest gradient, and of the least value per radius: flatter fields are saturated
 BAND = 0.018  # radii: a field that is flat at all probes is taken to rise to its values in a band of this width
 
 
@@ -77,7 +77,7 @@ class Occupancy(ByValue):
 def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None = None) -> Occupancy:
     """Excludes every cell with f(centre) > L · (half its diagonal), splits the others, and excludes again.
 
-    Without a `lipschitz` constant, L is measured: the steepest mean slope over any block of 2 × 2 × 2 cells, and the
+    Without a `lipschitz` constant, L is measured: the largest mean slope over any block of 2 × 2 × 2 cells, and the
     gradient in the cells nearest to the surface. Cells deep in the solid stay occupied, as rays may start in them.
     """
     shapes = evaluator.shapes
@@ -90,8 +90,8 @@ def find_occupancy(evaluator: Evaluator, like: Tensor, lipschitz: float | None =
     coarse = values.reshape(shapes, *[CELLS] * 3)
     if lipschitz is None:
         blocks = coarse.unfold(1, 2, 2).unfold(2, 2, 2).unfold(3, 2, 2).reshape(shapes, -1, 8)
-        steepest = _mean_slope(blocks, corners, width).amax(1)
-        bound = MARGIN * steepest.maximum(_steep_gradient(evaluator, centres, coarse.flatten(1), width / 64))
+        largest_slope = _mean_slope(blocks, corners, width).amax(1)
+        bound = MARGIN * largest_slope.maximum(_steep_gradient(evaluator, centres, coarse.flatten(1), width / 64))
     else:
         bound = like.new_full((shapes,), lipschitz)
     reach = (width * HALF_DIAGONAL * bound).reshape(-1, 1, 1, 1)
@@ -132,10 +132,10 @@ def _steep_gradient(evaluator: Evaluator, centres: Tensor, values: Tensor, step:
     newton = (values / slope).clamp_max(2 / CELLS * HALF_DIAGONAL).nan_to_num(0.0)
     points = points - F.normalize(gradient, dim=-1) * newton[..., None]
     slopes = torch.cat([slope, _gradient(evaluator, points, step).norm(dim=-1)], dim=1).nan_to_num(0.0)
-    steepest = slopes.amax(1, keepdim=True)
+    largest_slope = slopes.amax(1, keepdim=True)
     least = values[:, 0]
-    bound = slopes.masked_fill(slopes < FLAT * steepest, torch.nan).nanquantile(STEEP, dim=1)
-    return torch.where(steepest[:, 0] > FLAT * least, bound, least / BAND)
+    bound = slopes.masked_fill(slopes < FLAT * largest_slope, torch.nan).nanquantile(STEEP, dim=1)
+    return torch.where(largest_slope[:, 0] > FLAT * least, bound, least / BAND)
 
 
 def _gradient(evaluator: Evaluator, points: Float[Tensor, "shapes n 3"], step: float) -> Float[Tensor, "shapes n 3"]:

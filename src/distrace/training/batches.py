@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from distrace.checkpoints.model import VARIANT
-from distrace.errors import DoubtfulResult, about, explained
+from distrace.errors import DoubtfulResult, about, error_context
 
 MIN_MEDIAN_RADIUS = 0.012  # median distance from the origin of samples of a shape in the unit sphere, at least …
 MAX_MEDIAN_RADIUS = 1.2  # … and at most
@@ -67,7 +67,7 @@ def load_samples(paths: list[Path]) -> Samples:
     inside = []
     dropped = 0
     for path in paths:
-        with explained(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg", path):
+        with error_context(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg", path):
             with np.load(path, allow_pickle=False) as archive:
                 sides = [archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg")]
         with about(path):

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import torch
 
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.fields.decoder import NetworkSpecs
-from distrace.files import written
+from distrace.files import atomic_write
 from distrace.training.config import TrainConfig
-from distrace.training.losses import COURSE
+from distrace.training.losses import STEPS_PER_LOSS
 from distrace.training.trainer import Training, start
 
 NAME = "checkpoint.pt"
@@ -29,7 +29,7 @@ def save_training(folder: Path, training: Training, config: TrainConfig, names: 
         "codes": training.codes.detach(),
         "optimiser": training.optimiser.state_dict(),
     }
-    with written(folder / NAME) as file:
+    with atomic_write(folder / NAME) as file:
         torch.save(state, file)
 
 
@@ -41,7 +41,7 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
     path = folder / NAME
     if not path.exists():
         return None
-    with explained(f"{path} is not a checkpoint of a training run; move it away to start afresh"):
+    with error_context(f"{path} is not a checkpoint of a training run; move it away to start afresh"):
         state = torch.load(path, map_location=device, weights_only=True)
         config = TrainConfig(**state["config"])
         specs = NetworkSpecs(**state["specs"])
@@ -50,7 +50,7 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])
         training.step = operator.index(state["step"])
-        unknown = [math.nan] * -(-training.step // COURSE)  # of runs begun before losses were kept
+        unknown = [math.nan] * -(-training.step // STEPS_PER_LOSS)  # of runs begun before losses were kept
         training.losses = [float(loss) for loss in state.get("losses", unknown)]
     if state["names"] != names:
         raise ValueError(

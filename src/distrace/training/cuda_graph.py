@@ -11,7 +11,7 @@ from torch import Tensor
 WARM_UP_CALLS = 3  # warm-up calls before the capture: libraries allocate their workspaces in them
 
 
-class Recorded:
+class GraphedStep:
     """A function from GPU tensors of fixed shapes to a tensor, captured once and then replayed.
 
     Its control flow must not depend on their values.

@@ -19,7 +19,7 @@ CERTAIN = 0.002  # signs of samples nearer to the surface are ignored
 
 
 @dataclass(frozen=True)
-class Kept:
+class Distillation:
     """The original decoder, and the codes around which a fine-tuned one is compared with it.
 
     *Learning without Forgetting* (Li and Hoiem, ECCV 2016), of a field instead of a classifier.
@@ -31,10 +31,10 @@ class Kept:
     others: Mapping[str, Float[Tensor, "length"]]  # codes of its shapes that have no samples: they stay
 
     @staticmethod
-    def of(model: Model, names: Sequence[str]) -> "Kept":
+    def of(model: Model, names: Sequence[str]) -> "Distillation":
         """Returns the original `model`, for a training on shapes of these names."""
         others = {name: code for name, code in zip(model.shapes, model.codes, strict=True) if name not in names}
-        return Kept(model.decoder, model.codes_of(names), prior_of(model.codes), others)
+        return Distillation(model.decoder, model.codes_of(names), prior_of(model.codes), others)
 
     def drawn(self, shapes: Int[Tensor, "some"]) -> Float[Tensor, "some length"]:
         """Returns for each shape a random code between its own and a draw of the prior, with the prior's variance."""
@@ -50,7 +50,7 @@ class Kept:
         return self.decoder(points, codes[:, None])
 
 
-def dwelling(samples: Samples, model: Model, times: int) -> Samples:
+def oversampled(samples: Samples, model: Model, times: int) -> Samples:
     """Returns the samples, repeated `times` over where the model's signs are wrong; variants and new shapes as before.
 
     Places are chosen once, on both sides of the surface: a weight that a sample has only while its sign is wrong would
@@ -60,7 +60,7 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
     inside = []
     for name, pos, neg in zip(samples.names, samples.outside, samples.inside, strict=True):
         if VARIANT not in name and name in model.shapes:
-            wrong_pos, wrong_neg = _wrong_places(model, name, torch.cat([pos, neg])).split([len(pos), len(neg)])
+            wrong_pos, wrong_neg = _hard_samples(model, name, torch.cat([pos, neg])).split([len(pos), len(neg)])
             pos = torch.cat([pos, pos[wrong_pos].repeat(times - 1, 1)])
             neg = torch.cat([neg, neg[wrong_neg].repeat(times - 1, 1)])
         outside.append(pos)
@@ -69,7 +69,7 @@ def dwelling(samples: Samples, model: Model, times: int) -> Samples:
 
 
 @torch.no_grad()
-def _wrong_places(model: Model, name: str, samples: Float[Tensor, "n 4"]) -> Bool[Tensor, "n"]:
+def _hard_samples(model: Model, name: str, samples: Float[Tensor, "n 4"]) -> Bool[Tensor, "n"]:
     """Returns which samples lie within REACH of one whose sign the model has wrong."""
     from scipy.spatial import KDTree
 

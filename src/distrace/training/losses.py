@@ -5,7 +5,7 @@ from torch import Tensor
 
 from distrace.training.config import TrainConfig
 
-COURSE = 100  # steps whose mean loss is one entry of the history; the last entry may have fewer
+STEPS_PER_LOSS = 100  # steps whose mean loss is one entry of the history; the last entry may have fewer
 
 
 def training_loss(values: Tensor, distances: Tensor, config: TrainConfig) -> Tensor:
@@ -33,7 +33,7 @@ def clamped_error(values: Tensor, distances: Tensor, clamp: float) -> Tensor:
 
 def record(history: list[float], step: int, value: float) -> None:
     """Adds the loss of step number `step`, counted from 0, to the history."""
-    done = step % COURSE
+    done = step % STEPS_PER_LOSS
     if not done:
         history.append(0.0)
     history[-1] += (value - history[-1]) / (done + 1)

@@ -14,8 +14,8 @@ from distrace.checkpoints.model import Model
 from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.training.batches import Samples
 from distrace.training.config import TrainConfig
-from distrace.training.cuda_graph import Recorded
-from distrace.training.fine_tuning import Kept
+from distrace.training.cuda_graph import GraphedStep
+from distrace.training.fine_tuning import Distillation
 from distrace.training.losses import clamped_loss, record, training_loss
 
 
@@ -27,7 +27,7 @@ class Training:
     codes: nn.Parameter  # [shapes, length]
     optimiser: torch.optim.Adam
     step: int = 0
-    losses: list[float] = field(default_factory=list)  # the mean of each COURSE steps so far; the last may have fewer
+    losses: list[float] = field(default_factory=list)  # the mean of each STEPS_PER_LOSS steps; the last may have fewer
 
 
 @dataclass(frozen=True)
@@ -61,24 +61,26 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
     training.codes.copy_(model.codes_of(names))
 
 
-def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept | None = None) -> Iterator[Step]:
+def train(
+    samples: Samples, training: Training, config: TrainConfig, distillation: Distillation | None = None
+) -> Iterator[Step]:
     """Trains in place and yields after every step, from wherever `training` is to the last one.
 
-    The distillation loss of `kept` has the weight `config.keep`. A step's random draw depends on the seed and the step
+    The loss of `distillation` has the weight `config.keep`. A step's random draw depends on the seed and the step
     alone, so a run that was stopped and resumed ends with the same weights.
     """
     device = training.codes.device
-    step = partial(_step, training, config, kept)
+    step = partial(_step, training, config, distillation)
     training.decoder.train()
     _prepare(training.optimiser, device)
     if device.type == "cuda":
-        step = Recorded(step)
+        step = GraphedStep(step)
     while training.step < config.steps:
         began = time.perf_counter()
         _set_rates(training, config)
         torch.manual_seed((config.seed << 32) + training.step)
         shapes, batch = samples.drawn(config.shapes_per_step, config.samples_per_step, config.variant_weight)
-        between = () if kept is None else (kept.drawn(shapes),)
+        between = () if distillation is None else (distillation.drawn(shapes),)
         loss = step(shapes.to(device), batch, *between).item()
         record(training.losses, training.step, loss)
         training.step += 1
@@ -88,7 +90,7 @@ def train(samples: Samples, training: Training, config: TrainConfig, kept: Kept 
 def _step(
     training: Training,
     config: TrainConfig,
-    kept: Kept | None,
+    distillation: Distillation | None,
     shapes: Tensor,
     batch: Float[Tensor, "shapes n 4"],
     between: Float[Tensor, "shapes length"] | None = None,
@@ -98,10 +100,10 @@ def _step(
     rest = config.code_penalty * codes.square().sum(-1).mean()
     with torch.autocast(batch.device.type, torch.bfloat16, enabled=config.bfloat16, cache_enabled=False):
         values = training.decoder(batch[..., :3], codes[:, None])
-        if kept is not None and between is not None:
+        if distillation is not None and between is not None:
             points = batch[:, ::2, :3]
             now = training.decoder(points, between[:, None])
-            before = kept.values(points, between)
+            before = distillation.values(points, between)
             rest = rest + config.keep * clamped_loss(now.float(), before.float(), config.clamp)
     loss = training_loss(values.float(), batch[..., 3], config)
     training.optimiser.zero_grad()
@@ -113,10 +115,10 @@ def _step(
 
 def _prepare(optimiser: torch.optim.Adam, device: torch.device) -> None:
     """Sets Adam's `capturable` flag and tensor learning rates on a GPU, as CUDA graphs need; else resets them."""
-    recorded = device.type == "cuda"
+    graphed = device.type == "cuda"
     for group in optimiser.param_groups:
-        group["capturable"] = recorded
-        group["lr"] = torch.zeros((), device=device) if recorded else 0.0
+        group["capturable"] = graphed
+        group["lr"] = torch.zeros((), device=device) if graphed else 0.0
 
 
 def _set_rates(training: Training, config: TrainConfig) -> None:

@@ -17,7 +17,7 @@ from distrace.data.photo_readers.transforms import read_cameras
 from distrace.data.placement import placement_of
 from distrace.data.saved_scan import read_scan
 from distrace.data.scan import Scan
-from distrace.errors import explained
+from distrace.errors import error_context
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.scan_residuals import PlacedCode
 from distrace.pose import Similarity
@@ -44,7 +44,7 @@ def open_scene(name: str, code: str | None = None, device: str | torch.device = 
 
 def _result(folder: Path, device: torch.device) -> Scene:
     path = folder / "result.json"
-    with explained(f"{path} is not the result of a command", path):
+    with error_context(f"{path} is not the result of a command", path):
         content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
         name = content.get("model")
     if (folder / "checkpoint.pt").is_file():
@@ -98,7 +98,7 @@ def _photographed(folder: Path, content: dict[str, Any]) -> list[Camera]:
     if not (folder / "transforms.json").is_file():
         return []
     path = folder / "result.json"
-    with explained(f"{path} does not say where the object is", path):
+    with error_context(f"{path} does not say where the object is", path):
         sphere = content["unit_sphere"]
         unit = placement_of(sphere["centre"], sphere["radius"])
         place = Similarity.from_matrix(torch.tensor(content["T_unit_object"]))
@@ -109,21 +109,19 @@ def _photographed(folder: Path, content: dict[str, Any]) -> list[Camera]:
 def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device) -> Scene:
     path = folder / "checkpoint.pt"
     names = {each.name for each in fields(SurfaceSpecs)}
-    with explained(f"{path} is not the checkpoint of a reconstruction", path):
+    with error_context(f"{path} is not the checkpoint of a reconstruction", path):
         settings = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         surface = SurfaceNetwork(SurfaceSpecs(**{key: value for key, value in settings.items() if key in names}))
         surface.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["surface"])
         sphere = content["unit_sphere"]
         unit = placement_of(sphere["centre"], sphere["radius"])
-    scale = torch.tensor(unit.radius)
-    unit_place = Similarity(torch.eye(3), unit.centre.float(), scale)
     cameras: list[Camera] = []
     if (folder / "transforms.json").is_file():
         cameras = [unit.camera_to_unit(camera) for camera in read_cameras(folder / "transforms.json")]
     field = surface.requires_grad_(False).eval().to(device)
-    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit_place, device=device)
+    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit.similarity, device=device)
 
 
 def _placement(path: Path) -> Similarity:
-    with explained(f"{path} is not the placement of a completion", path):
+    with error_context(f"{path} is not the placement of a completion", path):
         return Similarity.from_matrix(torch.tensor(json.loads(path.read_text(encoding="utf-8"))["T_input_object"]))

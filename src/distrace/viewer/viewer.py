@@ -13,8 +13,8 @@ from torch import Tensor
 
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
-from distrace.files import save_json, save_text, written
-from distrace.mesh import MeshConfig, extract_mesh
+from distrace.files import save_json, save_text
+from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.optional import require
 from distrace.shading import save_png
 from distrace.viewer.image import Light
@@ -122,10 +122,7 @@ class Viewer:
         shown = self.shown
         scene = shown.field.scene
         folder = _fresh(self.out)
-        mesh = _mesh(scene, SAVED_CELLS)
-        mesh.apply_transform(scene.place.T_world_object.double().numpy())
-        with written(folder / "mesh.ply") as file:
-            mesh.export(file, file_type="ply")
+        save_mesh(folder / "mesh.ply", mesh_in_world(_mesh(scene, SAVED_CELLS), scene.place))
         if scene.code is not None:
             save_code(folder, scene.code, scene.place)
         if handle is not None:

@@ -10,15 +10,15 @@ import numpy as np
 from jaxtyping import Float
 
 from distrace.data.photo_readers.colmap_files import check_whole, with_point_lines
-from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, inside
-from distrace.errors import DoubtfulResult, about, explained
+from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, inside
+from distrace.errors import DoubtfulResult, about, error_context
 from distrace.optional import require
 
 PINHOLES = ("SIMPLE_PINHOLE", "PINHOLE")
 MIN_TRACK_LENGTH = 3  # images at least that see a point which is trusted
 
 
-def read(folder: Path) -> Shots | None:
+def read(folder: Path) -> Frames | None:
     """None where there is no model; raises `ValueError` for one that cannot be read, or is distorted.
 
     Of several models below `sparse` the one with most images is read. COLMAP's pixel centres are at +0.5, as ours. A
@@ -35,7 +35,7 @@ def read(folder: Path) -> Shots | None:
         of_models = f", the largest of {len(models)} models," if len(models) > 1 else ""
         sentence = f"{model}{of_models} has {len(placed)} of {images} photographs; the others are left out"
         warnings.warn(sentence, DoubtfulResult, stacklevel=4)
-    return Shots("COLMAP", tuple(_shot(folder, model, image) for image in placed), points=_points(found))
+    return Frames("COLMAP", tuple(_frame(folder, model, image) for image in placed), points=_points(found))
 
 
 def _models(folder: Path) -> list[Path]:
@@ -55,7 +55,7 @@ def _reconstruction(model: Path) -> Any:
 
     check_whole(model)
 
-    with explained(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
+    with error_context(f"{model} holds no whole model of COLMAP: cameras, images and points3D, all .bin or all .txt"):
         images = None if (model / "cameras.bin").is_file() else with_point_lines(model / "images.txt")
         if images is None:
             return Reconstruction(model)
@@ -65,7 +65,7 @@ def _reconstruction(model: Path) -> Any:
             return Reconstruction(copy)
 
 
-def _shot(folder: Path, model: Path, image: Any) -> Shot:
+def _frame(folder: Path, model: Path, image: Any) -> Frame:
     field = f"{model}: image {image.name}"
     with about(field):
         camera = image.camera
@@ -80,7 +80,7 @@ def _shot(folder: Path, model: Path, image: Any) -> Shot:
         pose = np.eye(4)
         pose[:3] = image.cam_from_world().inverse().matrix()
         mask = _mask(folder / "masks", image.name)
-        return Shot(field, path, camera.calibration_matrix(), pose, mask, (camera.height, camera.width))
+        return Frame(field, path, camera.calibration_matrix(), pose, mask, (camera.height, camera.width))
 
 
 def _mask(masks: Path, name: str) -> Path | None:

@@ -12,13 +12,13 @@ import numpy as np
 from jaxtyping import Float
 
 from distrace.data.placement import Placement
-from distrace.errors import explained
+from distrace.errors import error_context
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 
 
 @dataclass(frozen=True)
-class Shot:
+class Frame:
     """One view: files and a camera in OpenCV's axes, in the folder's world and in pixels with centres at +0.5."""
 
     field: str  # file and field that say so, for errors
@@ -30,18 +30,18 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Shots:
+class Frames:
     """All views, and where the folder has them the unit sphere's placement and points of the scene."""
 
     layout: str
-    views: tuple[Shot, ...]
+    views: tuple[Frame, ...]
     placement: Placement | None = None
     points: Float[np.ndarray, "points 3"] | None = None
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """Raises `ValueError` for a file that is no JSON, or no object."""
-    with explained(f"{path} cannot be read as JSON", path):
+    with error_context(f"{path} cannot be read as JSON", path):
         content = json.loads(path.read_text(encoding="utf-8-sig"))  # some editors write a mark first
     if not isinstance(content, dict):
         raise ValueError(f"{path} holds a {type(content).__name__}; an object with names is needed")
@@ -58,7 +58,7 @@ def listed(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any
 
 def matrix(entry: dict[str, Any], name: str, *shape: int) -> Float[np.ndarray, "rows columns"]:
     """Raises `ValueError`, naming the field, where it is no finite matrix of that shape."""
-    with explained(f"{name} is no matrix of {' × '.join(map(str, shape))} numbers"):
+    with error_context(f"{name} is no matrix of {' × '.join(map(str, shape))} numbers"):
         values = np.array(entry[name], np.float64)
         if values.shape != shape:
             raise ValueError(f"its shape is {list(values.shape)}")

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from distrace.data.photo_readers.frames import Shot, Shots, images_in, matrix
+from distrace.data.photo_readers.frames import Frame, Frames, images_in, matrix
 from distrace.data.placement import Placement
-from distrace.errors import about, explained
+from distrace.errors import about, error_context
 
 NAME = "cameras_sphere.npz"
 TOLERANCE = 1e-5  # of the radius, between the scales of views and of axes
 
 
-def read(folder: Path) -> Shots | None:
+def read(folder: Path) -> Frames | None:
     """None where there is no cameras_sphere.npz; raises `ValueError` for one that is not as it should be.
 
     Principal points stay as they are. In some of these files pixel centres are at 0 (DTU's, whose quarters have them
@@ -27,14 +27,17 @@ def read(folder: Path) -> Shots | None:
     matrices = _matrices(path)
     _check_counts(path, matrices, images, masks)
     if not images:
-        return Shots("IDR", ())
+        return Frames("IDR", ())
     places = masks or [None] * len(images)
-    shots = tuple(_shot(path, matrices, k, image, mask) for k, (image, mask) in enumerate(zip(images, places)))
-    return Shots("IDR", shots, _placement(path, matrices, len(images)))
+    frames = tuple(_frame(path, matrices, k, image, mask) for k, (image, mask) in enumerate(zip(images, places)))
+    return Frames("IDR", frames, _placement(path, matrices, len(images)))
 
 
 def _matrices(path: Path) -> dict[str, np.ndarray]:
-    with explained(f"{path} cannot be read as an .npz of matrices", path), np.load(path, allow_pickle=False) as archive:
+    with (
+        error_context(f"{path} cannot be read as an .npz of matrices", path),
+        np.load(path, allow_pickle=False) as archive,
+    ):
         return {name: archive[name] for name in archive.files if name.startswith(("world_mat_", "scale_mat_"))}
 
 
@@ -49,12 +52,12 @@ def _check_counts(path: Path, matrices: dict[str, np.ndarray], images: list[Path
         )
 
 
-def _shot(path: Path, matrices: dict[str, np.ndarray], k: int, image: Path, mask: Path | None) -> Shot:
+def _frame(path: Path, matrices: dict[str, np.ndarray], k: int, image: Path, mask: Path | None) -> Frame:
     field = f"{path}: world_mat_{k}"
     with about(path):
         projection = matrix(matrices, f"world_mat_{k}", 4, 4)[:3]
     with about(field):
-        return Shot(field, image, *decomposed(projection), mask)
+        return Frame(field, image, *decomposed(projection), mask)
 
 
 def decomposed(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -3,29 +3,29 @@
 from pathlib import Path
 from typing import Any
 
-from distrace.data.photo_readers.frames import Shot, Shots, file_of, listed, matrix, read_json
+from distrace.data.photo_readers.frames import Frame, Frames, file_of, listed, matrix, read_json
 from distrace.data.placement import Placement, placement_of
 from distrace.errors import about
 
 NAME = "views.json"
 
 
-def read(folder: Path) -> Shots | None:
+def read(folder: Path) -> Frames | None:
     """None where there is no views.json; raises `ValueError` for one that is not as it should be."""
     path = folder / NAME
     if not path.is_file():
         return None
     content = read_json(path)
     entries = listed(content, "views", path)
-    shots = tuple(_shot(folder, entry, f"{path}: views[{k}]") for k, entry in enumerate(entries))
-    return Shots("views.json", shots, _placement(content, path))
+    frames = tuple(_frame(folder, entry, f"{path}: views[{k}]") for k, entry in enumerate(entries))
+    return Frames("views.json", frames, _placement(content, path))
 
 
-def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
+def _frame(folder: Path, entry: dict[str, Any], field: str) -> Frame:
     with about(field):
         image = file_of(folder, entry, "image")
         mask = file_of(folder, entry, "mask") if entry.get("mask") is not None else None
-        return Shot(field, image, matrix(entry, "intrinsics", 3, 3), matrix(entry, "T_world_camera", 4, 4), mask)
+        return Frame(field, image, matrix(entry, "intrinsics", 3, 3), matrix(entry, "T_world_camera", 4, 4), mask)
 
 
 def _placement(content: dict[str, Any], path: Path) -> Placement | None:

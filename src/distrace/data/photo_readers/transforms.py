@@ -1,6 +1,7 @@
 """`transforms.json`, as NeRF (Mildenhall et al., ECCV 2020), instant-ngp and nerfstudio write it."""
 
 import math
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ import numpy as np
 import torch
 
 from distrace.camera import Camera
-from distrace.data.photo_readers.frames import SUFFIXES, Shot, Shots, file_of, listed, matrix, read_json
+from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, listed, matrix, read_json
 from distrace.data.pictures import picture_size
 from distrace.data.placement import MAX_COORDINATE
 from distrace.errors import about
@@ -22,7 +23,7 @@ OTHER_CAMERAS = ("fisheye", "latlong", "equirectangular", "orthographic", "ortho
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])  # its cameras look along −z, with y up
 
 
-def read(folder: Path) -> Shots | None:
+def read(folder: Path) -> Frames | None:
     """None where there is no such file; raises `ValueError` for one that is not as it should be.
 
     The world stays as it is: often z is up in it.
@@ -32,11 +33,11 @@ def read(folder: Path) -> Shots | None:
         return None
     content = read_json(path)
     entries = listed(content, "frames", path)
-    shots = tuple(_shot(folder, content | entry, f"{path}: frames[{k}]") for k, entry in enumerate(entries))
-    return Shots(path.name, shots)
+    frames = tuple(_frame(folder, content | entry, f"{path}: frames[{k}]") for k, entry in enumerate(entries))
+    return Frames(path.name, frames)
 
 
-def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
+def _frame(folder: Path, entry: dict[str, Any], field: str) -> Frame:
     """Of a frame, with what is said for all frames wherever it says nothing itself."""
     with about(field):
         _check_distortion(entry)
@@ -45,7 +46,7 @@ def _shot(folder: Path, entry: dict[str, Any], field: str) -> Shot:
         has_size = "w" in entry and "h" in entry
         size = (int(_number(entry, "h")), int(_number(entry, "w"))) if has_size else picture_size(image)
         pose = matrix(entry, "transform_matrix", 4, 4) @ OPENGL
-        return Shot(f"{field}.transform_matrix", image, _intrinsics(entry, *size), pose, mask, size)
+        return Frame(f"{field}.transform_matrix", image, _intrinsics(entry, *size), pose, mask, size)
 
 
 def _check_distortion(entry: dict[str, Any]) -> None:
@@ -95,15 +96,16 @@ def _number(entry: dict[str, Any], name: str) -> float:
     return float(value)
 
 
-def save_cameras(path: Path, cameras: Mapping[str, Camera]) -> None:
-    """Writes the cameras of images, by the names of their files, as other tools read them."""
+def save_cameras(path: Path, cameras: Mapping[Path, Camera]) -> None:
+    """Writes the cameras of images, by their files, as nerfstudio and instant-ngp read them: paths are from `path`."""
     frames = []
-    for name, camera in cameras.items():
+    folder = path.parent.resolve()
+    for file, camera in cameras.items():
         intrinsics = camera.intrinsics.tolist()
         pose = camera.T_world_camera.cpu().double().numpy() @ OPENGL
         frames.append(
             {
-                "file_path": name,
+                "file_path": Path(os.path.relpath(file.resolve(), folder)).as_posix(),
                 "w": camera.width,
                 "h": camera.height,
                 "fl_x": intrinsics[0][0],

@@ -18,7 +18,7 @@ MOST_CONTRADICTIONS = 0.3  # of a further view's points where the first view sho
 
 
 @dataclass(frozen=True)
-class ObjectView:
+class SegmentedView:
     """A depth image with all that it shows, and the object's pixels in it."""
 
     scene: View
@@ -45,7 +45,7 @@ class ObjectView:
         return found & ~self.inside
 
 
-def find_object(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, isolate: bool) -> ObjectView:
+def find_object(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, isolate: bool) -> SegmentedView:
     """Returns the object that a mask marks in a depth image; without a mask, all that has a depth.
 
     Separate pieces are left out. `isolate`: the mask holds other things, too, as a rectangle does; so is the floor.
@@ -61,10 +61,10 @@ def find_object(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, 
     points = scene.masked(inside).points()
     kept = object_points(points, floor, 1.0) if isolate else object_points(points, None)
     inside = _only(inside, kept)
-    return ObjectView(scene, inside, around, None if isolate else mask, floor, up)
+    return SegmentedView(scene, inside, around, None if isolate else mask, floor, up)
 
 
-def find_again(first: ObjectView, scene: View) -> ObjectView | None:
+def find_object_again(first: SegmentedView, scene: View) -> SegmentedView | None:
     """Returns the object of a first view in a further one; None where that shows hardly any of it.
 
     A point belongs to the object if it lies near the points of the first view, and above the floor. It does not if the
@@ -99,7 +99,7 @@ def find_again(first: ObjectView, scene: View) -> ObjectView | None:
     if near.sum() < LEAST_POINTS:
         return None
     inside = _only(scene.seen, near)
-    return ObjectView(scene, inside, _rectangle_around(inside), None, first.floor, first.up)
+    return SegmentedView(scene, inside, _rectangle_around(inside), None, first.floor, first.up)
 
 
 def check_count(count: int) -> None:

@@ -1,4 +1,4 @@
-"""Reads scans from files: depth images with cameras, observations, clouds of points; also several of one world."""
+"""Reads the files that a user gives of an object: depth images with cameras, observations, clouds of points."""
 
 import warnings
 from collections.abc import Sequence
@@ -11,13 +11,18 @@ from torch import Tensor
 
 from distrace.data.cloud import read_points
 from distrace.data.depth_image import KINDS, load_depth_image, load_intrinsics, load_mask, load_pose
-from distrace.data.object_view import ObjectView, find_again, find_object
 from distrace.data.observation import View, read_scene
 from distrace.data.scan import Scan, joined, scan_of_object, scan_of_points
+from distrace.data.segmented_view import SegmentedView, find_object, find_object_again
 from distrace.data.up import Up
 from distrace.errors import DoubtfulResult, about
 
 CLOUDS = (".ply", ".pcd", ".xyz", ".obj", ".off", ".stl", ".glb")
+DEPTH_IMAGE = "a depth image"
+CLOUD = "a cloud"
+OBSERVATION = "an observation"
+Image = tuple[View, Bool[Tensor, "height width"] | None, Up]
+"""All that an image shows, the mask in its file, and up."""
 
 
 @dataclass(frozen=True)
@@ -32,60 +37,78 @@ class ScanOptions:
 
 
 def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Scan:
-    """Reads depth images or observations of one object by cameras in one world, or clouds.
+    """Reads depth images or observations of one object by cameras in one world, or clouds in one frame.
 
     Images after the first that have no mask of their own give the points near those of the first, and their free rays.
     Up is by default −y of the first camera for depth images, whose y points down, and y for everything else.
     Raises `ValueError`, in one sentence, for what cannot be read or does not fit together.
     """
-    images = [path for path in paths if _kind(path) in KINDS]
-    poses = _poses(images, options.poses)
-    clouds = []
-    read = []
+    kind = _kind_of_all(paths)
+    if kind == CLOUD:
+        _refuse(paths[0], "is an image's", mask=options.mask, box=options.box)
+    if kind != DEPTH_IMAGE:
+        _refuse(paths[0], "is a depth image's", intrinsics=options.intrinsics, poses=options.poses or None)
+    if kind == CLOUD:
+        return joined([_read_cloud(path, options) for path in paths])
+    if kind == DEPTH_IMAGE:
+        poses = _poses(paths, options.poses)
+        return _scan_of_images(paths, [_read_depth_image(*each, options) for each in zip(paths, poses)], options)
+    return _scan_of_images(paths, [(*read_scene(path), Up.along(options.up or "y")) for path in paths], options)
+
+
+def _kind_of_all(paths: Sequence[Path]) -> str:
+    """Returns what all inputs are. Raises `ValueError` where they differ, as their options and frames do."""
+    first_of_kind: dict[str, Path] = {}
     for path in paths:
-        if _kind(path) in CLOUDS:
-            clouds.append(_read_cloud(path, options))
-        else:
-            pose = poses.pop(0) if _kind(path) in KINDS else None
-            read.append((path, *_read_image(path, pose, options)))
+        suffix = path.suffix.lower()
+        kind = DEPTH_IMAGE if suffix in KINDS else CLOUD if suffix in CLOUDS else OBSERVATION
+        first_of_kind.setdefault(kind, path)
+    if len(first_of_kind) > 1:
+        given = " and ".join(f"{path} ({kind})" for kind, path in first_of_kind.items())
+        raise ValueError(
+            f"{given} were given together; give inputs of one kind: depth images with --poses, observations of one"
+            " world, or clouds in one frame"
+        )
+    return next(iter(first_of_kind))
+
+
+def _scan_of_images(paths: Sequence[Path], images: Sequence[Image], options: ScanOptions) -> Scan:
+    """Finds the object in the first image, and again in the others."""
     scans = []
-    first: ObjectView | None = None
-    for path, scene, mask, up in read:
+    first: SegmentedView | None = None
+    for path, (scene, mask, up) in zip(paths, images):
         with about(path):
             if first is None:
                 found = first = _find_first(scene, mask, options, up)
             elif mask is not None:
                 found = find_object(scene, mask, up, isolate=False)
             else:
-                found = find_again(first, scene)
+                found = find_object_again(first, scene)
         if found is None:
             sentence = f"{path} shows hardly a point near the object of the first image, and is left out"
-            warnings.warn(sentence, DoubtfulResult, stacklevel=2)
+            warnings.warn(sentence, DoubtfulResult, stacklevel=3)
         else:
             scans.append(scan_of_object(found))
-    return joined([*scans, *clouds])
+    return joined(scans)
 
 
-def _poses(images: Sequence[Path], poses: Sequence[Path]) -> list[Path | None]:
+def _poses(images: Sequence[Path], poses: Sequence[Path]) -> Sequence[Path | None]:
     """Returns the pose of each depth image. Raises `ValueError` for any other number of them."""
-    if not poses and len(images) > 1:
+    if not poses and len(images) == 1:
+        return [None]
+    if not poses:
         raise ValueError(
             f"{len(images)} depth images were given without --poses: a file for each, in the same order, with the 4 × 4"
             " matrix that maps its camera to the world"
         )
-    if poses and len(poses) != len(images):
+    if len(poses) != len(images):
         raise ValueError(
             f"--poses names {len(poses)} files for {len(images)} depth images; give one for each, in the same order"
         )
-    return list(poses) or [None] * len(images)
+    return poses
 
 
-def _read_image(path: Path, pose: Path | None, options: ScanOptions) -> tuple[View, Tensor | None, Up]:
-    """Returns all that an image shows, the mask in its file, and up."""
-    if _kind(path) not in KINDS:
-        _refuse(path, "is a depth image's", intrinsics=options.intrinsics)
-        scene, mask = read_scene(path)
-        return scene, mask, Up.along(options.up or "y")
+def _read_depth_image(path: Path, pose: Path | None, options: ScanOptions) -> Image:
     if options.intrinsics is None:
         raise ValueError(f"{path} is a depth image, and needs --intrinsics: fx,fy,cx,cy in pixels, or a file")
     depth = load_depth_image(path)
@@ -97,15 +120,9 @@ def _read_image(path: Path, pose: Path | None, options: ScanOptions) -> tuple[Vi
 
 
 def _read_cloud(path: Path, options: ScanOptions) -> Scan:
-    _refuse(path, "is a depth image's", intrinsics=options.intrinsics)
-    _refuse(path, "is an image's", mask=options.mask, box=options.box)
     points = torch.from_numpy(read_points(path)).float()
     with about(path):
         return scan_of_points(points, Up.along(options.up or "y"))
-
-
-def _kind(path: Path) -> str:
-    return path.suffix.lower()
 
 
 def _refuse(path: Path, whose: str, **given: object) -> None:
@@ -115,7 +132,7 @@ def _refuse(path: Path, whose: str, **given: object) -> None:
             raise ValueError(f"--{name} was given for {path}, and {whose} alone; leave it out")
 
 
-def _find_first(scene: View, mask: Bool[Tensor, "height width"] | None, options: ScanOptions, up: Up) -> ObjectView:
+def _find_first(scene: View, mask: Bool[Tensor, "height width"] | None, options: ScanOptions, up: Up) -> SegmentedView:
     """Returns the object that the options tell, or else the mask of the file."""
     height, width = scene.depth.shape
     if options.mask is not None:
