@@ -104,7 +104,8 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     path = place.out / "trials" / trial.file
     model = place.model_of(trial.category)
     config = ScanFitConfig()
-    mark = fingerprint(model, place.resolution, config, MEASURE)
+    network = load_placement_network(dict(place.models)[trial.category])
+    mark = fingerprint(model, place.resolution, config, MEASURE, network=network)
     if path.is_file():
         content = read_json(path)
         if content.pop("made_by", None) == mark:
@@ -113,7 +114,6 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     scene = sensed(solid, hash_of(trial.shape) + trial.scene, trial.hidden)
     scan = scan_of_view(scene.view, scene.mask, Up.along("y"))
     known = scene.place if trial.told else None
-    network = load_placement_network(place.models[trial.category])
     fit = fit_scan(model.decoder, scan, prior_of(model.codes), config, known, network=network)
     mesh = extract_mesh(place.field_of(trial.category, fit.code), place.mesh)
     found = by_extent(mesh, fit.place)

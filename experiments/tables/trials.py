@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float
-from torch import Tensor
+from torch import Tensor, nn
 
 from distrace.checkpoints.model import Model, load_model
 from distrace.errors import error_context
@@ -67,11 +67,12 @@ def read_json(path: Path) -> Any:
 
 
 @lru_cache
-def fingerprint(model: Model, *settings: object) -> str:
-    """Returns a hash of the model's weights and of the settings."""
+def fingerprint(model: Model, *settings: object, network: nn.Module | None = None) -> str:
+    """Returns a hash of the model's weights, of those of a network that starts the fit, and of the settings."""
     named = re.sub(r" at 0x[0-9a-f]+", "", repr(settings))  # functions, of which only the name stays the same
     digest = hashlib.sha256(named.encode())
-    for tensor in (*model.decoder.state_dict().values(), model.codes):
+    others = () if network is None else network.state_dict().values()
+    for tensor in (*model.decoder.state_dict().values(), model.codes, *others):
         digest.update(tensor.cpu().numpy().tobytes())
     return digest.hexdigest()[:16]
 

@@ -1,4 +1,4 @@
-"""Proposals: rotations about up or anywhere, typical shapes, and the right place among the first."""
+"""Starts of scans: rotations about up or anywhere, typical shapes, and the true place among the ends."""
 
 import math
 
@@ -9,15 +9,29 @@ import torch
 from distrace.data.scan import scan_of_points
 from distrace.data.up import Up
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.fitting.proposals import SHAPES, TURNS, Volumes, _rotations, proposed, typical_codes
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
+from distrace.fitting.scan_residuals import PlacedCode
+from distrace.fitting.scan_starts import (
+    TURNS,
+    TYPICAL_CODES,
+    Starts,
+    axes_around,
+    belief_of,
+    turns_about,
+    typical_codes,
+)
 from distrace.pose import Similarity
 from distrace.prior import prior_of
+
+TRUE = Similarity(
+    roma.rotvec_to_rotmat(torch.tensor([0.0, 0.6, 0.0])), torch.tensor([10.0, -4.0, 3.0]), torch.tensor(5.0)
+)
 
 
 @pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, -0.8, -0.6), (-1.0, 0.0, 0.0)])
 def test_all_turns_about_up_are_rotations(up: tuple[float, float, float]) -> None:
     axis = torch.tensor(up)
-    rotations = _rotations(axis[None])
+    rotations = turns_about(axis)
     assert len(rotations) == TURNS
     torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand(TURNS, 3, 3), atol=1e-5, rtol=0)
     torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(TURNS))
@@ -27,22 +41,31 @@ def test_all_turns_about_up_are_rotations(up: tuple[float, float, float]) -> Non
 
 
 def test_an_unknown_up_is_near_to_one_that_is_tried() -> None:
-    rotations = _rotations(torch.empty(0, 3))
-    for rotation in roma.random_rotmat(50):
-        nearest = roma.rotmat_geodesic_distance(rotations, rotation.expand(len(rotations), 3, 3)).min()
-        assert float(nearest) < math.radians(37)
+    axes = axes_around()
+    torch.testing.assert_close(axes.norm(dim=-1), torch.ones(26))
+    anywhere = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
+    assert float((anywhere @ axes.T).amax(1).min()) > math.cos(math.radians(33))
 
 
 def test_typical_codes_are_training_codes_and_not_too_many() -> None:
     codes = torch.randn(200, 8, generator=torch.Generator().manual_seed(0))
     chosen = typical_codes(prior_of(codes), 0)
-    assert 0 < len(chosen) <= SHAPES
+    assert 0 < len(chosen) <= TYPICAL_CODES
     assert (chosen[:, None] == codes).all(-1).any(1).all()
     assert len(typical_codes(prior_of(codes[:5]), 0)) == 5
 
 
-def blob() -> tuple[Decoder, torch.Tensor]:
-    """A decoder whose shapes are boxes: |x|, |y| and |z| less a half-width that the code changes."""
+def test_joined_starts_are_numbered_anew() -> None:
+    prior = prior_of(torch.randn(5, 4, generator=torch.Generator().manual_seed(0)))
+    scan = scan_of_points(TRUE.to_world(box_points(100)), Up.along("y"))
+    one = Starts([PlacedCode(0, prior.mean, prior.mean[:0], TRUE)], [belief_of(TRUE, scan)], 3)
+    assert [state.start for state in (one + one).states] == [0, 1]
+    assert (one + one).evaluations == 6
+    assert belief_of(TRUE, scan).size == pytest.approx(5.0)
+
+
+def boxes() -> tuple[Decoder, torch.Tensor]:
+    """A decoder whose shapes are boxes of nearly one size: |x|, |y| and |z| less a half-width."""
     decoder = Decoder(NetworkSpecs(dims=(6, 3), code_length=2, latent_in=(), norm_layers=()))
     with torch.no_grad():
         for parameter in decoder.parameters():
@@ -65,28 +88,12 @@ def box_points(count: int) -> torch.Tensor:
     return half * points
 
 
-def test_values_of_volumes_are_those_of_the_field() -> None:
-    decoder, codes = blob()
-    volumes = Volumes.of(decoder, prior_of(codes), 0)
-    points = 0.9 * (2 * torch.rand(300, 3, generator=torch.Generator().manual_seed(0)) - 1)
-    points = points[points.norm(dim=-1) < 0.9]
-    exact = decoder.fields(volumes.codes)(points.expand(len(volumes.codes), -1, -1)).T
-    assert (volumes.at(points) - exact).abs().max() < 0.12
-    assert volumes.only(2).at(points).equal(volumes.at(points)[:, 2:3])
-
-
-def test_the_true_place_is_among_the_first_proposals() -> None:
-    decoder, codes = blob()
-    prior = prior_of(codes)
-    turn = roma.rotvec_to_rotmat(torch.tensor([0.0, 0.6, 0.0]))
-    true = Similarity(turn, torch.tensor([10.0, -4.0, 3.0]), torch.tensor(5.0))
-    scan = scan_of_points(true.to_world(box_points(3000)), Up.along("y"))
-    with torch.no_grad():
-        found = proposed(scan, decoder, prior, 6, 0)
-    assert [each.start for each in found] == list(range(6))
+def test_a_model_without_a_network_is_placed_too() -> None:
+    decoder, codes = boxes()
+    scan = scan_of_points(TRUE.to_world(box_points(3000)), Up.along("y"))
+    found = fit_scan(decoder, scan, prior_of(codes), ScanFitConfig()).place
     half_turn = roma.rotvec_to_rotmat(torch.tensor([0.0, math.pi, 0.0]))
-    best = found[0].place
-    apart = [float(roma.rotmat_geodesic_distance(best.rotation, turn @ also)) for also in (torch.eye(3), half_turn)]
-    assert min(apart) < math.radians(20)
-    assert float((best.translation - true.translation).norm()) < 1.0
-    assert float(best.scale) == pytest.approx(5.0, rel=0.2)
+    turns = (TRUE.rotation, TRUE.rotation @ half_turn)
+    assert min(float(roma.rotmat_geodesic_distance(found.rotation, turn)) for turn in turns) < math.radians(5)
+    assert float((found.translation - TRUE.translation).norm()) < 0.25
+    assert float(found.scale) == pytest.approx(5.0, rel=0.1)

@@ -1,0 +1,152 @@
+"""Where a fit to a scan starts: at the placements that a network finds likely, or at places all about the scan."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import roma
+import torch
+from jaxtyping import Float
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from distrace.data.scan import Scan
+from distrace.fitting.placement_network import PlacementGuess, PlacementNetwork, guess_placement
+from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem
+from distrace.fitting.solver import charbonnier
+from distrace.pose import Similarity
+from distrace.prior import Prior
+
+LIKELY = 6  # placements of the mean shape that the fit starts from
+TYPICAL = 4  # starts from typical shapes, …
+TYPICAL_PLACES = 2  # … at the likeliest placements
+TYPICAL_CODES = 16  # training codes, one of each group
+TURNS = 12  # about up, without a network
+SIZES = (1.05, 1.4)  # of the unit sphere, in radii of the scan, without a network
+DEVIATION_FACTOR = 1.5  # × the network's deviations: the points that it has seen count again
+LEAST_DEVIATION = 0.02
+
+
+@dataclass(frozen=True)
+class Starts:
+    """Where to start, and where each start is likely to end; states are numbered from 0."""
+
+    states: list[PlacedCode]
+    beliefs: list[Belief]
+    evaluations: int = 0  # of the field
+
+    def __add__(self, other: "Starts") -> "Starts":
+        states = [*self.states, *other.states]
+        numbered = [replace(state, start=number) for number, state in enumerate(states)]
+        return Starts(numbered, [*self.beliefs, *other.beliefs], self.evaluations + other.evaluations)
+
+    def best(self, count: int, problem_of: Callable[[Sequence[Belief]], ScanProblem]) -> "Starts":
+        """Returns the `count` states of the least loss."""
+        if len(self.states) <= count:
+            return self
+        problem = problem_of(self.beliefs)
+        losses = torch.tensor([each.loss(1.0, charbonnier) for each in problem.residuals(self.states)])
+        chosen = losses.argsort()[:count].tolist()
+        states = [replace(self.states[k], start=number) for number, k in enumerate(chosen)]
+        evaluations = self.evaluations + sum(problem.evaluations.values())
+        return Starts(states, [self.beliefs[k] for k in chosen], evaluations)
+
+
+def find_starts(
+    scan: Scan,
+    prior: Prior,
+    network: PlacementNetwork | None,
+    place: Similarity | None,
+    problem_of: Callable[[Sequence[Belief]], ScanProblem],
+    seed: int,
+) -> Starts:
+    """Returns starts from the mean shape at likely placements, or at `place`; and from typical shapes at the best.
+
+    `problem_of` takes what is likely of the states that are compared.
+    """
+    if place is not None:
+        places = Starts([PlacedCode(0, prior.mean, prior.mean[:0], place)], [belief_of(place, scan)])
+    elif network is not None:
+        places = _of_network(scan, prior, network, seed).best(LIKELY, problem_of)
+    else:
+        places = _all_about(scan, prior).best(2 * LIKELY, problem_of)
+    codes = typical_codes(prior, seed)
+    states: list[PlacedCode] = []
+    beliefs: list[Belief] = []
+    for state, belief in list(zip(places.states, places.beliefs))[:TYPICAL_PLACES]:
+        for code in codes:
+            states.append(PlacedCode(len(states), code, prior.mean[:0], state.place))
+            beliefs.append(belief)
+    return places + Starts(states, beliefs).best(TYPICAL, problem_of)
+
+
+def belief_of(place: Similarity, scan: Scan, guess: PlacementGuess | None = None) -> Belief:
+    """Returns what is likely of an end: a guess's centre and size, and the candidate of up that the start has."""
+    axis = place.rotation[:, 1]
+    up = scan.ups[(scan.ups @ axis).argmax()] if len(scan.ups) else None
+    belief = Belief(float(place.scale), place.translation, up)
+    if guess is None:
+        return belief
+    return replace(
+        belief,
+        size_deviation=max(DEVIATION_FACTOR * guess.size_deviation, LEAST_DEVIATION),
+        centre_deviation=max(DEVIATION_FACTOR * guess.centre_deviation, LEAST_DEVIATION),
+    )
+
+
+def _of_network(scan: Scan, prior: Prior, network: PlacementNetwork, seed: int) -> Starts:
+    """Returns the mean shape at the likeliest placements, the best of each up first."""
+    states = []
+    beliefs = []
+    for up in scan.ups if len(scan.ups) else axes_around().to(scan.points):
+        guess = guess_placement(network, scan.to("cpu"), up.cpu(), seed)
+        for place in guess.places(LIKELY):
+            place = place.to(prior.mean.device)
+            states.append(PlacedCode(len(states), prior.mean, prior.mean[:0], place))
+            beliefs.append(belief_of(place, scan, guess))
+    return Starts(states, beliefs)
+
+
+def _all_about(scan: Scan, prior: Prior) -> Starts:
+    """Returns the mean shape in all turns about up, in two sizes, about the middle of the scan."""
+    states = []
+    beliefs = []
+    for up in scan.ups if len(scan.ups) else axes_around().to(scan.points):
+        for rotation in turns_about(up):
+            along = scan.points @ rotation
+            middle = rotation @ (along.quantile(0.02, dim=0) + along.quantile(0.98, dim=0)) / 2
+            for size in SIZES:
+                place = Similarity(rotation, middle, middle.new_tensor(size * scan.radius))
+                states.append(PlacedCode(len(states), prior.mean, prior.mean[:0], place))
+                beliefs.append(belief_of(place, scan))
+    return Starts(states, beliefs)
+
+
+def turns_about(up: Float[Tensor, "3"]) -> Float[Tensor, "turns 3 3"]:
+    """Returns rotations that take the y axis to `up`."""
+    side = normalize(torch.linalg.cross(up, up.roll(1) + 0.1), dim=-1)
+    upright = torch.stack([torch.linalg.cross(up, side), up, side], dim=1)
+    angles = torch.arange(TURNS).to(up) * (2 * math.pi / TURNS)
+    return upright @ roma.rotvec_to_rotmat(angles[:, None] * angles.new_tensor([0.0, 1.0, 0.0]))
+
+
+def axes_around() -> Float[Tensor, "26 3"]:
+    """Returns unit vectors in all directions: to the faces, edges and corners of a cube."""
+    directions = torch.cartesian_prod(*(torch.tensor([-1.0, 0.0, 1.0]),) * 3)
+    return normalize(directions[directions.norm(dim=-1) > 0], dim=-1)
+
+
+def typical_codes(prior: Prior, seed: int) -> Float[Tensor, "shapes length"]:
+    """Returns the training codes nearest to the means of `TYPICAL_CODES` groups (k-means)."""
+    from scipy.cluster.vq import kmeans2
+
+    if len(prior.codes) <= TYPICAL_CODES:
+        few = list(prior.codes) or [prior.mean]
+        return torch.stack(few)
+    codes = torch.stack(list(prior.codes))
+    w = torch.linalg.solve(prior.basis, (codes - prior.mean).T).T
+    group: Any = kmeans2
+    means, _ = group(w.cpu().double().numpy(), TYPICAL_CODES, minit="++", seed=seed)
+    nearest = torch.cdist(torch.from_numpy(means).to(w), w).argmin(1)
+    return codes[nearest.unique()]
