@@ -20,7 +20,7 @@ from distrace.pose import Similarity
 from distrace.prior import Prior
 from distrace.rays import Rays, meet_sphere
 
-CODE_DEVIATION = 1.0  # of a code's coordinates from those that it starts from
+CODE_DEVIATION = 0.7  # of a code's coordinates from those that it starts from
 GROWTH = 0.25  # standard deviation of the logarithm of the size, about the size that the start has
 EFFECTIVE_POINTS = 200.0  # what all points count together, however many: errors of a shape are alike nearby
 EFFECTIVE_RAYS = 600.0  # the same, of rays where a mask may be wrong
