@@ -24,7 +24,7 @@ TYPICAL_PLACES = 2  # … at the likeliest placements
 TYPICAL_CODES = 16  # training codes, one of each group
 TURNS = 12  # about up, without a network
 SIZES = (1.05, 1.4)  # of the unit sphere, in radii of the scan, without a network
-DEVIATION_FACTOR = 1.5  # × the network's deviations: the points that it has seen count again
+DEVIATION_FACTOR = 0.6  # × the network's deviations: residuals of points are not as independent as they count
 LEAST_DEVIATION = 0.02
 
 
