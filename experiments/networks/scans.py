@@ -105,20 +105,19 @@ def _stacked(scan: Scan, scene: Scene, seed: int) -> TrainingScans:
     random = torch.Generator().manual_seed(seed)
     points = _rows(len(scan.points), random)
     rays = _rows(len(scan.free_until), random)
-    one = TrainingScans(
-        scan.points[points],
-        scan.free.origins[rays],
-        scan.free.directions[rays],
-        scan.free_until[rays],
-        scan.centre,
-        torch.tensor(scan.radius),
-        scan.ups[0],
-        scene.view.camera.T_world_camera[:3, 3].clone(),
-        scene.place.rotation,
-        scene.place.translation,
-        scene.place.scale,
+    return TrainingScans(
+        scan.points[points][None],
+        scan.free.origins[rays][None],
+        scan.free.directions[rays][None],
+        scan.free_until[rays][None],
+        scan.centre[None],
+        torch.tensor([scan.radius]),
+        scan.ups[:1],
+        scene.view.camera.T_world_camera[None, :3, 3].clone(),
+        scene.place.rotation[None],
+        scene.place.translation[None],
+        scene.place.scale[None],
     )
-    return TrainingScans(*(getattr(one, field.name)[None] for field in fields(one)))
 
 
 def _rows(count: int, random: torch.Generator) -> Tensor:
