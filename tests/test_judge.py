@@ -83,3 +83,10 @@ def test_another_fit_elsewhere_makes_it_doubtful() -> None:
 def test_a_wrong_silhouette_tells() -> None:
     assert judged(scan(), SPHERE, PLACE, silhouette=0.8).name == "doubtful"
     assert judged(scan(), SPHERE, PLACE, silhouette=0.4).name == "failed"
+
+
+def test_an_unlikely_placement_is_doubtful() -> None:
+    assert judged(scan(), SPHERE, PLACE, surprise=3.9).name == "trusted"
+    found = judged(scan(), SPHERE, PLACE, surprise=4.1)
+    assert found.name == "doubtful"
+    assert "of another size, or elsewhere" in found.reason

@@ -82,7 +82,7 @@ def test_a_fit_shows_its_loss_its_cost_and_its_verdict(kind: str) -> None:
     if kind == "code":
         shown = CodeFit(code, 0.123456, {}, 1_234_567, 2.5)._repr_html_()
     else:
-        verdict = Verdict("doubtful", 0.9, 0.0, 0.4, 0.0, None, "10 % of the points lie away & apart")
+        verdict = Verdict("doubtful", 0.9, 0.0, 0.4, 0.0, None, None, "10 % of the points lie away & apart")
         shown = ScanFit(code, Similarity.identity(), 0.123456, verdict, {}, 1_234_567, 2.5, ())._repr_html_()
         assert "<td>doubtful: 10 % of the points lie away &amp; apart</td>" in shown
     assert all(f"<td>{fact}</td>" in shown for fact in ("0.1235", "1,234,567", "2.5"))

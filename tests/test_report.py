@@ -73,7 +73,7 @@ def completion() -> Completion:
     mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.62)
     points = np.asarray(mesh.vertices)
     return Completion(
-        verdict=Verdict("trusted", 0.99, 0.0, 0.9, 0.0, 0.97, "99% of the points lie on the surface"),
+        verdict=Verdict("trusted", 0.99, 0.0, 0.9, 0.0, 0.97, 0.4, "99% of the points lie on the surface"),
         title="Sphere <b>&</b> co",
         observed_depth=depth,
         observed_mask=truth.mask,

@@ -129,3 +129,16 @@ def test_signed_distances_are_met_and_far_ones_only_tell_the_side() -> None:
     fit.sample = replace(fit.sample, distances=torch.full((40,), -5.0).double())
     (wrong,) = fit.residuals([state])
     assert (wrong.values[:40] > 0).all()
+
+
+def test_a_placement_surprises_by_its_size_or_by_its_centre() -> None:
+    belief = Belief(2.0, PLACE.translation, None, size_deviation=0.1, centre_deviation=0.05)
+    place = Similarity(PLACE.rotation, PLACE.translation, torch.tensor(2.0))
+    assert belief.surprise(place) == pytest.approx(0, abs=1e-5)
+    assert belief.surprise(replace_scale(place, 2.0 * torch.e**0.2)) == pytest.approx(2, rel=1e-3)
+    moved = Similarity(place.rotation, place.translation + torch.tensor([0.3, -0.3, 0.3]), place.scale)
+    assert belief.surprise(moved) == pytest.approx(3, rel=1e-3), "0.15 sizes along each axis"
+
+
+def replace_scale(place: Similarity, scale: float) -> Similarity:
+    return Similarity(place.rotation, place.translation, torch.tensor(scale))

@@ -96,15 +96,19 @@ def fit_scan(
     else:
         starts = Starts([start], [belief_of(start.place, scan)])
     ends = run_rounds(starts.states, config.rounds, partial(problem_of, beliefs=starts.beliefs), SOLVER, progress)
-    return _fitted(decoder, scan, prior, ends, starts.evaluations, began)
+    belief = starts.beliefs[ends.states[0].start]
+    return _fitted(decoder, scan, prior, ends, starts.evaluations, belief.surprise(ends.states[0].place), began)
 
 
-def _fitted(decoder: Decoder, scan: Scan, prior: Prior, ends: Ends, evaluations: int, began: float) -> ScanFit:
+def _fitted(
+    decoder: Decoder, scan: Scan, prior: Prior, ends: Ends, evaluations: int, surprise: float, began: float
+) -> ScanFit:
     least, best = ends.losses[0], ends.states[0]
     codes = [state.code(prior) for state in ends.states]
     sdf = decoder.field(codes[0])
     equal = [k for k, loss in enumerate(ends.losses) if k and loss <= (1 + EQUAL) * least]
     others = tuple((codes[k], ends.states[k].place) for k in equal)
-    verdict = judged(scan, sdf, best.place, [(decoder.field(code), place) for code, place in others])
+    placed = [(decoder.field(code), place) for code, place in others]
+    verdict = judged(scan, sdf, best.place, placed, surprise=surprise)
     seconds = time.perf_counter() - began
     return ScanFit(codes[0], best.place, least, verdict, ends.curves, evaluations + ends.evaluations, seconds, others)

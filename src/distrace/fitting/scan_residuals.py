@@ -50,7 +50,13 @@ class Belief:
     centre: Float[Tensor, "3"]
     up: Float[Tensor, "3"] | None
     size_deviation: float = GROWTH  # of the logarithm
-    centre_deviation: float = torch.inf  # in sizes
+    centre_deviation: float = torch.inf  # in sizes, along each axis
+
+    def surprise(self, place: Similarity) -> float:
+        """Returns how many deviations a placement is away, by its size or by its centre."""
+        size = abs(float((place.scale / self.size).log())) / self.size_deviation
+        shift = (place.translation - self.centre).square().mean().sqrt() / self.size
+        return max(size, float(shift) / self.centre_deviation)
 
 
 @dataclass(frozen=True)
