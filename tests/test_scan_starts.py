@@ -1,4 +1,4 @@
-"""Starts of scans: rotations about up or anywhere, typical shapes, and the true place among the ends."""
+"""Starts of scans: rotations about up or anywhere, and the true place among the ends."""
 
 import math
 
@@ -13,12 +13,10 @@ from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.scan_residuals import PlacedCode
 from distrace.fitting.scan_starts import (
     TURNS,
-    TYPICAL_CODES,
     Starts,
     axes_around,
     belief_of,
     turns_about,
-    typical_codes,
 )
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -45,14 +43,6 @@ def test_an_unknown_up_is_near_to_one_that_is_tried() -> None:
     torch.testing.assert_close(axes.norm(dim=-1), torch.ones(26))
     anywhere = torch.nn.functional.normalize(torch.randn(200, 3, generator=torch.Generator().manual_seed(0)), dim=-1)
     assert float((anywhere @ axes.T).amax(1).min()) > math.cos(math.radians(33))
-
-
-def test_typical_codes_are_training_codes_and_not_too_many() -> None:
-    codes = torch.randn(200, 8, generator=torch.Generator().manual_seed(0))
-    chosen = typical_codes(prior_of(codes), 0)
-    assert 0 < len(chosen) <= TYPICAL_CODES
-    assert (chosen[:, None] == codes).all(-1).any(1).all()
-    assert len(typical_codes(prior_of(codes[:5]), 0)) == 5
 
 
 def test_joined_starts_are_numbered_anew() -> None:

@@ -92,7 +92,7 @@ def fit_scan(
         )
 
     if start is None:
-        starts = find_starts(scan, prior, network, place, partial(problem_of, SCREENING), config.seed)
+        starts = find_starts(scan, prior, quick, network, place, partial(problem_of, SCREENING), config.seed)
     else:
         starts = Starts([start], [belief_of(start.place, scan)])
     ends = run_rounds(starts.states, config.rounds, partial(problem_of, beliefs=starts.beliefs), SOLVER, progress)

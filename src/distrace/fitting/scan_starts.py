@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import roma
 import torch
@@ -12,16 +11,20 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace.data.scan import Scan
+from distrace.fields.decoder import Decoder
+from distrace.fields.precision import BFloat16Decoder
 from distrace.fitting.placement_network import PlacementGuess, PlacementNetwork, guess_placement
-from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem
+from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem, ScanSample
 from distrace.fitting.solver import charbonnier
+from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
 from distrace.prior import Prior
 
 LIKELY = 6  # placements of the mean shape that the fit starts from
-TYPICAL = 4  # starts from typical shapes, …
-TYPICAL_PLACES = 2  # … at the likeliest placements
-TYPICAL_CODES = 16  # training codes, one of each group
+NEAREST = 2  # starts from the training shapes that are nearest to the scan, …
+NEAREST_PLACES = 2  # … at each of the likeliest placements
+HINT_POINTS = 80  # of the surface, and of free space, that tell which are nearest
+HINT_MARGIN = 0.05  # radii of the unit sphere before the end of a ray, from where space may not be free
 TURNS = 12  # about up, without a network
 SIZES = (1.05, 1.4)  # of the unit sphere, in radii of the scan, without a network
 DEVIATION_FACTOR = 0.6  # × the network's deviations: residuals of points are not as independent as they count
@@ -56,12 +59,13 @@ class Starts:
 def find_starts(
     scan: Scan,
     prior: Prior,
+    decoder: Decoder | BFloat16Decoder,
     network: PlacementNetwork | None,
     place: Similarity | None,
     problem_of: Callable[[Sequence[Belief]], ScanProblem],
     seed: int,
 ) -> Starts:
-    """Returns starts from the mean shape at likely placements, or at `place`; and from typical shapes at the best.
+    """Returns the mean shape at likely placements, or at `place`, and the nearest training shapes at the best of them.
 
     `problem_of` takes what is likely of the states that are compared.
     """
@@ -71,14 +75,22 @@ def find_starts(
         places = _of_network(scan, prior, network, seed).best(LIKELY, problem_of)
     else:
         places = _all_about(scan, prior).best(2 * LIKELY, problem_of)
-    codes = typical_codes(prior, seed)
-    states: list[PlacedCode] = []
-    beliefs: list[Belief] = []
-    for state, belief in list(zip(places.states, places.beliefs))[:TYPICAL_PLACES]:
-        for code in codes:
-            states.append(PlacedCode(len(states), code, prior.mean[:0], state.place))
-            beliefs.append(belief)
-    return places + Starts(states, beliefs).best(TYPICAL, problem_of)
+    nearest = Starts([], [])
+    for state, belief in list(zip(places.states, places.beliefs))[:NEAREST_PLACES]:
+        hints = _hints(scan, state.place, seed)
+        codes, evaluations = nearest_codes(decoder, prior.codes, hints, NEAREST)
+        states = [PlacedCode(0, code, prior.mean[:0], state.place) for code in codes]
+        nearest += Starts(states, [belief] * len(states), evaluations)
+    return places + nearest
+
+
+def _hints(scan: Scan, place: Similarity, seed: int) -> Hints:
+    """Returns points of the scan and of free space in the frame of an object."""
+    random = torch.Generator().manual_seed(seed)
+    sample = ScanSample.drawn(scan, HINT_POINTS, HINT_POINTS, random)
+    rays = place.rays_in_object(sample.rays)
+    until = sample.until / place.scale - HINT_MARGIN
+    return Hints.of(ScanSample(place.to_object(sample.points), rays, until, sample.free), random)
 
 
 def belief_of(place: Similarity, scan: Scan, guess: PlacementGuess | None = None) -> Belief:
@@ -135,18 +147,3 @@ def axes_around() -> Float[Tensor, "26 3"]:
     """Returns unit vectors in all directions: to the faces, edges and corners of a cube."""
     directions = torch.cartesian_prod(*(torch.tensor([-1.0, 0.0, 1.0]),) * 3)
     return normalize(directions[directions.norm(dim=-1) > 0], dim=-1)
-
-
-def typical_codes(prior: Prior, seed: int) -> Float[Tensor, "shapes length"]:
-    """Returns the training codes nearest to the means of `TYPICAL_CODES` groups (k-means)."""
-    from scipy.cluster.vq import kmeans2
-
-    if len(prior.codes) <= TYPICAL_CODES:
-        few = list(prior.codes) or [prior.mean]
-        return torch.stack(few)
-    codes = torch.stack(list(prior.codes))
-    w = torch.linalg.solve(prior.basis, (codes - prior.mean).T).T
-    group: Any = kmeans2
-    means, _ = group(w.cpu().double().numpy(), TYPICAL_CODES, minit="++", seed=seed)
-    nearest = torch.cdist(torch.from_numpy(means).to(w), w).argmin(1)
-    return codes[nearest.unique()]
