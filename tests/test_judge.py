@@ -86,7 +86,7 @@ def test_a_wrong_silhouette_tells() -> None:
 
 
 def test_an_unlikely_placement_is_doubtful() -> None:
-    assert judged(scan(), SPHERE, PLACE, surprise=3.9).name == "trusted"
-    found = judged(scan(), SPHERE, PLACE, surprise=4.1)
+    assert judged(scan(), SPHERE, PLACE, prior_deviation=3.9).name == "trusted"
+    found = judged(scan(), SPHERE, PLACE, prior_deviation=4.1)
     assert found.name == "doubtful"
     assert "of another size, or elsewhere" in found.reason

@@ -12,17 +12,20 @@ from distrace.checkpoints.model import bundled_models
 from distrace.data.observation import View
 from distrace.data.scan import Scan, scan_of_points, scan_of_view
 from distrace.data.up import Up
+from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.placement_network import (
     CELLS,
-    FILE,
+    PLACEMENT_FILE,
     SLICES,
-    TURNS,
-    Frame,
+    TURN_BINS,
+    GridFrame,
     PlacementGuess,
     grids_of,
     guess_placement,
     load_placement_network,
 )
+from distrace.fitting.rounds import Round
+from distrace.fitting.solver import charbonnier
 from distrace.pose import Similarity
 from distrace.rays import Rays
 
@@ -32,9 +35,9 @@ PLACE = Similarity(
 )
 
 
-def level_frame() -> Frame:
+def level_frame() -> GridFrame:
     ahead = torch.tensor([[0.3, -0.4, -1.0]])
-    return Frame.facing(UP[None], ahead, torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([2.0]))
+    return GridFrame.facing(UP[None], ahead, torch.tensor([[1.0, 2.0, 3.0]]), torch.tensor([2.0]))
 
 
 def test_a_frame_is_upright_and_faces_the_viewer() -> None:
@@ -70,7 +73,7 @@ def test_free_space_ends_before_the_surface() -> None:
 
 
 def test_likely_turns_are_apart_and_the_best_comes_first() -> None:
-    turns = torch.full((TURNS,), 1e-3)
+    turns = torch.full((TURN_BINS,), 1e-3)
     turns[[10, 11, 46]] = torch.tensor([0.2, 0.4, 0.3])
     guess = PlacementGuess(torch.eye(3), turns, torch.zeros(3), torch.tensor(2.0), 0.1, 0.1)
     first, second, third = (roma.rotmat_to_rotvec(place.rotation)[1].rad2deg() for place in guess.places(3))
@@ -101,6 +104,19 @@ def test_the_network_finds_a_chair(scan: Scan) -> None:
     assert min(apart) < 0.2
     assert float(guess.size / PLACE.scale) == pytest.approx(1, abs=0.15)
     assert float((guess.centre - PLACE.translation).norm()) < 0.2 * float(PLACE.scale)
+
+
+def test_a_fit_starts_at_the_guess_and_tells_how_far_it_went(scan: Scan) -> None:
+    model = dt.load_model("chairs")
+    network = load_placement_network("chairs")
+    short = ScanFitConfig(rounds=(Round(3, 2, 8, 60, 40, 4, 0.06, charbonnier),))
+    fit = fit_scan(model.decoder, scan, dt.prior_of(model.codes), short, network=network)
+    assert float(fit.place.scale / PLACE.scale) == pytest.approx(1, abs=0.15)
+    assert fit.verdict.prior_deviation is not None
+    told = fit_scan(model.decoder, scan, dt.prior_of(model.codes), short, PLACE, network=network)
+    assert told.place is PLACE
+    assert told.verdict.prior_deviation is None
+    assert fit_scan(model.decoder, scan, dt.prior_of(model.codes), short).verdict.prior_deviation is None
 
 
 def test_a_guess_moves_with_the_scan(scan: Scan) -> None:
@@ -138,7 +154,7 @@ def test_a_cloud_without_a_viewer_has_a_guess() -> None:
 
 def test_a_model_without_a_network_has_none_and_a_damaged_one_is_named(tmp_path: Path) -> None:
     assert load_placement_network(tmp_path) is None
-    (tmp_path / FILE).write_bytes(b"no tensors")
+    (tmp_path / PLACEMENT_FILE).write_bytes(b"no tensors")
     with pytest.raises(ValueError, match=r"placement\.safetensors is not a safetensors file of a placement network"):
         load_placement_network(tmp_path)
 

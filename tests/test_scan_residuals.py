@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from distrace.fields.decoder import Decoder, NetworkSpecs
-from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem, ScanSample, extended
+from distrace.fitting.scan_residuals import PlacedCode, PlacementPrior, ScanProblem, ScanSample, extended
 from distrace.fitting.solver import Residuals
 from distrace.pose import Similarity
 from distrace.prior import prior_of
@@ -31,7 +31,7 @@ def problem(points: Tensor, rays: Rays, until: Tensor, free: int, **options: boo
         prior,
         sample,
         0.1,
-        [Belief(1.8, torch.tensor([0.1, -0.9, 4.2]).double(), up, 0.2, 0.3)],
+        [PlacementPrior(1.8, torch.tensor([0.1, -0.9, 4.2]).double(), up, 0.2, 0.3)],
         0.1,
         8,
         **options,
@@ -131,13 +131,13 @@ def test_signed_distances_are_met_and_far_ones_only_tell_the_side() -> None:
     assert (wrong.values[:40] > 0).all()
 
 
-def test_a_placement_surprises_by_its_size_or_by_its_centre() -> None:
-    belief = Belief(2.0, PLACE.translation, None, size_deviation=0.1, centre_deviation=0.05)
+def test_a_placement_deviations_by_its_size_or_by_its_centre() -> None:
+    likely = PlacementPrior(2.0, PLACE.translation, None, size_deviation=0.1, centre_deviation=0.05)
     place = Similarity(PLACE.rotation, PLACE.translation, torch.tensor(2.0))
-    assert belief.surprise(place) == pytest.approx(0, abs=1e-5)
-    assert belief.surprise(replace_scale(place, 2.0 * torch.e**0.2)) == pytest.approx(2, rel=1e-3)
+    assert likely.prior_deviation(place) == pytest.approx(0, abs=1e-5)
+    assert likely.prior_deviation(replace_scale(place, 2.0 * torch.e**0.2)) == pytest.approx(2, rel=1e-3)
     moved = Similarity(place.rotation, place.translation + torch.tensor([0.3, -0.3, 0.3]), place.scale)
-    assert belief.surprise(moved) == pytest.approx(3, rel=1e-3), "0.15 sizes along each axis"
+    assert likely.prior_deviation(moved) == pytest.approx(3, rel=1e-3), "0.15 sizes along each axis"
 
 
 def replace_scale(place: Similarity, scale: float) -> Similarity:

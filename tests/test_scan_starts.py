@@ -12,10 +12,10 @@ from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.scan_residuals import PlacedCode
 from distrace.fitting.scan_starts import (
-    TURNS,
+    TRIED_TURNS,
     Starts,
     axes_around,
-    belief_of,
+    placement_prior,
     turns_about,
 )
 from distrace.pose import Similarity
@@ -26,16 +26,15 @@ TRUE = Similarity(
 )
 
 
-@pytest.mark.parametrize("up", [(0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, -0.8, -0.6), (-1.0, 0.0, 0.0)])
-def test_all_turns_about_up_are_rotations(up: tuple[float, float, float]) -> None:
-    axis = torch.tensor(up)
+@pytest.mark.parametrize("axis", [*axes_around(), torch.tensor([0.0, -0.8, -0.6])])
+def test_all_turns_about_up_are_rotations(axis: torch.Tensor) -> None:
     rotations = turns_about(axis)
-    assert len(rotations) == TURNS
-    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand(TURNS, 3, 3), atol=1e-5, rtol=0)
-    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(TURNS))
-    torch.testing.assert_close(rotations[:, :, 1], axis.expand(TURNS, 3), atol=1e-6, rtol=0)
+    assert len(rotations) == TRIED_TURNS
+    torch.testing.assert_close(rotations @ rotations.mT, torch.eye(3).expand(TRIED_TURNS, 3, 3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotations), torch.ones(TRIED_TURNS))
+    torch.testing.assert_close(rotations[:, :, 1], axis.expand(TRIED_TURNS, 3), atol=1e-6, rtol=0)
     step = roma.rotmat_geodesic_distance(rotations[0], rotations[1])
-    assert float(step) == pytest.approx(2 * math.pi / TURNS, abs=1e-4)
+    assert float(step) == pytest.approx(2 * math.pi / TRIED_TURNS, abs=1e-4)
 
 
 def test_an_unknown_up_is_near_to_one_that_is_tried() -> None:
@@ -48,10 +47,10 @@ def test_an_unknown_up_is_near_to_one_that_is_tried() -> None:
 def test_joined_starts_are_numbered_anew() -> None:
     prior = prior_of(torch.randn(5, 4, generator=torch.Generator().manual_seed(0)))
     scan = scan_of_points(TRUE.to_world(box_points(100)), Up.along("y"))
-    one = Starts([PlacedCode(0, prior.mean, prior.mean[:0], TRUE)], [belief_of(TRUE, scan)], 3)
+    one = Starts([PlacedCode.at(TRUE, prior.mean)], [placement_prior(TRUE, scan)], 3)
     assert [state.start for state in (one + one).states] == [0, 1]
     assert (one + one).evaluations == 6
-    assert belief_of(TRUE, scan).size == pytest.approx(5.0)
+    assert placement_prior(TRUE, scan).size == pytest.approx(5.0)
 
 
 def boxes() -> tuple[Decoder, torch.Tensor]:

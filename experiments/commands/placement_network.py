@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import safetensors.torch
-import torch
 import tyro
 
 from distrace.cli.common import show_table
 from distrace.cli.console import origin, progress, start
-from distrace.files import atomic_write
-from distrace.fitting.placement_network import FILE, PlacementNetwork
+from distrace.fitting.placement_network import PLACEMENT_FILE, save_placement_network
 from experiments.datasets.splits import Meshes, on_side
 from experiments.networks.scans import ScanMaker, TrainingScans, joined_scans
 from experiments.networks.training import VALIDATION, trained, validated
@@ -36,10 +33,10 @@ class TrainPlacement:
                 f"--scans {self.scans} --steps {self.steps} were given; give over {VALIDATION}, and over 0"
             )
         run = start(self.out or Path("out") / f"placement-{self.category}")
-        scans = self._scans(run.out / "scans.pt")
+        scans = self._scans(run.out / f"scans-{self.category}-{self.seed}.pt")
         with progress("steps", self.steps) as bar:
             network = trained(scans, self.steps, self.seed, lambda step: bar.advance(to=step))
-        save_network(run.out / FILE, network)
+        save_placement_network(run.out / PLACEMENT_FILE, network)
         row = {"class": self.category, "scans": self.scans, **validated(network, scans)}
         show_table([row])
         run.finish({"rows": [row], **origin()})
@@ -47,22 +44,13 @@ class TrainPlacement:
     def _scans(self, path: Path) -> TrainingScans:
         parts = [TrainingScans.load(path)] if path.is_file() else []
         done = sum(map(len, parts))
-        maker = ScanMaker(self.category, on_side("train", self.category), self.meshes, self.seed + done)
+        maker = ScanMaker(self.category, on_side("train", self.category), self.meshes, self.seed)
         with progress("scans", self.scans) as bar:
             while done < self.scans:
-                parts.append(maker.make())
+                parts.append(maker.make(done))
                 done += 1
                 bar.advance(to=done)
                 if done % SAVED_EVERY == 0 or done == self.scans:
                     parts = [joined_scans(parts)]
                     parts[0].save(path)
         return joined_scans(parts)[slice(0, self.scans)]
-
-
-def save_network(path: Path, network: PlacementNetwork) -> None:
-    """Writes a placement network in half precision, as a model's folder has it."""
-    tensors: dict[str, torch.Tensor] = {}
-    for name, tensor in network.state_dict().items():
-        tensors[name] = (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
-    with atomic_write(path) as file:
-        file.write(safetensors.torch.save(tensors))

@@ -12,6 +12,7 @@ from distrace.data.scan import Scan, scan_of_view
 from distrace.data.shapes import Shape
 from distrace.data.solid import Solid, normalised
 from distrace.data.up import Up
+from distrace.errors import error_context
 from distrace.files import atomic_write
 from distrace.fitting.placement_network import POINTS
 from experiments.datasets.sensor import Scene, sensed
@@ -53,21 +54,25 @@ class TrainingScans:
 
     @staticmethod
     def load(path: Path) -> "TrainingScans":
-        return TrainingScans(**torch.load(path, weights_only=True))
+        """Raises `ValueError` for a file that holds no scans."""
+        with error_context(f"{path} holds no simulated scans; remove it", path):
+            return TrainingScans(**torch.load(path, weights_only=True))
 
 
 class ScanMaker:
-    """Makes one scan after the other; a scan that shows too little is made again."""
+    """Makes scans by their numbers; one that shows too little is made again."""
 
     def __init__(self, category: str, shapes: list[Shape], meshes: Path, seed: int) -> None:
         self.category = category
         self.shapes = shapes
         self.meshes = meshes
-        self.random = np.random.default_rng([seed, STREAM])
+        self.seed = seed
+        self.random = np.random.default_rng()  # of the scan that is made
         self.solids: dict[str, Solid] = {}
 
-    def make(self) -> TrainingScans:
-        """Returns one scan, stacked."""
+    def make(self, number: int) -> TrainingScans:
+        """Returns one scan, stacked; the same number has always the same."""
+        self.random = np.random.default_rng([self.seed, STREAM, number])
         while True:
             seed = int(self.random.integers(1 << 30))
             scene = sensed(self._solid(seed), seed, bool(self.random.integers(2)), REDUCTION)
@@ -95,16 +100,16 @@ class ScanMaker:
         spans = []
         for axis in (1, 0):
             occupied = mask.any(axis).nonzero()[:, 0]
-            before, after = self.random.integers(0, BOX_MARGIN, 2)
-            spans.append(slice(max(int(occupied[0] - before), 0), int(occupied[-1] + after) + 2))
+            before, after = self.random.integers(0, BOX_MARGIN + 1, 2)
+            spans.append(slice(max(int(occupied[0] - before), 0), int(occupied[-1] + after) + 1))
         box[spans[0], spans[1]] = True
         return box
 
 
 def _stacked(scan: Scan, scene: Scene, seed: int) -> TrainingScans:
     random = torch.Generator().manual_seed(seed)
-    points = _rows(len(scan.points), random)
-    rays = _rows(len(scan.free_until), random)
+    points = _repeated_rows(len(scan.points), random)
+    rays = _repeated_rows(len(scan.free_until), random)
     return TrainingScans(
         scan.points[points][None],
         scan.free.origins[rays][None],
@@ -120,7 +125,7 @@ def _stacked(scan: Scan, scene: Scene, seed: int) -> TrainingScans:
     )
 
 
-def _rows(count: int, random: torch.Generator) -> Tensor:
+def _repeated_rows(count: int, random: torch.Generator) -> Tensor:
     """Returns `POINTS` row numbers, of each row as often as of any other."""
     order = torch.randperm(count, generator=random)
     return order[torch.arange(POINTS) % count]

@@ -11,7 +11,8 @@ from torch import Tensor
 from torch.nn.functional import log_softmax, normalize, softmax
 from torch.nn.utils import clip_grad_norm_
 
-from distrace.fitting.placement_network import TURNS, Frame, PlacementNetwork, grids_of
+from distrace.fitting.placement_network import TURN_BINS, GridFrame, PlacementNetwork, grids_of, likeliest_turns
+from distrace.fitting.scan_starts import LIKELY
 from distrace.rays import Rays
 from experiments.networks.scans import TrainingScans
 
@@ -66,7 +67,7 @@ def views_of(scans: TrainingScans, random: torch.Generator, varied: bool) -> Vie
         ahead = _turned(ahead, about)
         radius = radius * (RESIZED * torch.randn(count, generator=random)).exp()
         centre = centre + SHIFTED * radius[:, None] * torch.randn(count, 3, generator=random)
-    frame = Frame.facing(up, ahead, centre, radius)
+    frame = GridFrame.facing(up, ahead, centre, radius)
     grids = grids_of(frame, points, known, Rays(scans.origins, scans.directions), until, random)
     rotation = frame.axes.transpose(1, 2) @ scans.rotation
     turn = torch.atan2(rotation[:, 0, 2] - rotation[:, 2, 0], rotation[:, 0, 0] + rotation[:, 2, 2])
@@ -110,9 +111,13 @@ def loss_of(network: PlacementNetwork, views: Views) -> Tensor:
 
 def _apart(turn: Float[Tensor, "b"]) -> Float[Tensor, "b turns"]:
     """Returns how far each of the network's turns is from the true one, in radians."""
-    turns = torch.arange(TURNS) * (2 * math.pi / TURNS)
-    difference = turn[:, None] - turns
-    return torch.atan2(difference.sin(), difference.cos()).abs()
+    turns = torch.arange(TURN_BINS) * (2 * math.pi / TURN_BINS)
+    return _difference(turn[:, None], turns)
+
+
+def _difference(first: Tensor, second: Tensor) -> Tensor:
+    """Returns the angles between directions, from 0 to π."""
+    return torch.atan2((first - second).sin(), (first - second).cos()).abs()
 
 
 def trained(scans: TrainingScans, steps: int, seed: int, progress: Callable[[int], None]) -> PlacementNetwork:
@@ -122,7 +127,7 @@ def trained(scans: TrainingScans, steps: int, seed: int, progress: Callable[[int
     network = PlacementNetwork()
     optimiser = torch.optim.AdamW(network.parameters(), weight_decay=WEIGHT_DECAY)
     for step in range(1, steps + 1):
-        fall = (1 + math.cos(math.pi * step / steps)) / 2
+        fall = (1 + math.cos(math.pi * (step - 1) / steps)) / 2
         optimiser.param_groups[0]["lr"] = LEARNING_RATE * fall * min(1.0, step / WARM_UP)
         chosen = torch.randint(len(scans) - VALIDATION, (BATCH,), generator=random)
         loss = loss_of(network, views_of(scans[chosen], random, varied=True))
@@ -139,12 +144,12 @@ def validated(network: PlacementNetwork, scans: TrainingScans) -> dict[str, floa
     """Returns errors on the last scans: medians, and how often one of the six likeliest turns is right."""
     views = views_of(scans[slice(-VALIDATION, None)], torch.Generator().manual_seed(1), varied=False)
     logits, mean, _ = network(views.grids)
-    degrees = _apart(views.turn).rad2deg()
-    likeliest = logits.topk(6).indices
+    likeliest = likeliest_turns(logits.softmax(-1), LIKELY)
+    degrees = _difference(views.turn[:, None], likeliest).rad2deg()
     off = (views.place - mean).abs()
     return {
         "loss": round(float(loss_of(network, views)), 3),
-        "one_of_six_turns_within_5_degrees": round(float((degrees.gather(1, likeliest).amin(1) < 5).float().mean()), 3),
+        "one_of_six_turns_within_5_degrees": round(float((degrees.amin(1) < 5).float().mean()), 3),
         "centre_percent_of_radius": round(100 * float(off[:, :3].norm(dim=-1).median()), 2),
         "size_percent": round(100 * float(off[:, 3].median()), 2),
         "tilt_degrees": round(float(off[:, 4:].norm(dim=-1).median().rad2deg()), 2),

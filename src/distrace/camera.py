@@ -218,6 +218,10 @@ class Camera(ByValue):
     def to(self, device: torch.device | str) -> "Camera":
         return replace(self, intrinsics=self.intrinsics.to(device), T_world_camera=self.T_world_camera.to(device))
 
+    def float(self) -> "Camera":
+        """Returns the camera in single precision."""
+        return replace(self, intrinsics=self.intrinsics.float(), T_world_camera=self.T_world_camera.float())
+
     def _ahead(self, pixels: Tensor) -> Float[Tensor, "*batch_pixels 3"]:
         """Returns the points of pixels at depth 1, in the camera's axes."""
         axes = (1,) * (pixels.dim() - 1)

@@ -12,7 +12,7 @@ from torch.nn.functional import pad
 from distrace.camera import Camera
 from distrace.equality import ByValue
 from distrace.rays import Rays
-from distrace.vectors import length
+from distrace.vectors import length, perpendicular
 
 
 def exp_se3(
@@ -75,7 +75,7 @@ def aimed(camera: Camera, pixel: Float[Tensor, "2"]) -> Camera:
     towards_origin = translation / length(translation).clamp_min(1e-6)
     axis = torch.cross(towards_origin, towards_pixel, dim=-1)
     if not length(axis) > 1e-6:  # straight behind: any axis across serves
-        axis = torch.cross(towards_origin, towards_origin.roll(1) + 0.1, dim=-1)
+        axis = perpendicular(towards_origin)
     angle = torch.acos((towards_origin @ towards_pixel).clamp(-1, 1))
     turn = roma.rotvec_to_rotmat(axis / length(axis) * angle)
     return with_object_at(camera, turn @ rotation, turn @ translation)

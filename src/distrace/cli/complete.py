@@ -17,6 +17,7 @@ from distrace.data.cloud import Cloud, load_cloud
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
 from distrace.data.scan_inputs import CLOUDS, ScanOptions, load_scan
+from distrace.data.segmented_view import check_count
 from distrace.errors import error_context
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
@@ -108,7 +109,9 @@ class Complete:
 
     def _placed(self, run: Run, mesh: MeshConfig) -> Verdict:
         scan = load_scan(self.inputs, ScanOptions(self.up, self.intrinsics, self.mask, self.box, self.poses))
-        scan = scan if self.points is None else scan.sparse(self.points, self.seed)
+        if self.points is not None:
+            scan = scan.sparse(self.points, self.seed)
+            check_count(len(scan.points))
         truth = None if self.reference is None else _reference(self.reference)
         model = opened_for(run, self.model)
         network = load_placement_network(self.model)

@@ -91,6 +91,8 @@ def _fitted(task: ScanTask) -> ScanFit:
     prior = prior_of(task.model.codes)
     scan = task.scan.to(task.mesh.device)
     console.print(f"fitting {len(scan.points):,} points and {len(scan.free_until):,} rays of free space")
+    if task.network is None:
+        console.print(f"{task.model.name} has no placement network: twelve turns and two sizes are tried instead")
     with progress("fitting", config.total) as bar:
         return fit_scan(
             task.model.decoder, scan, prior, config, progress=lambda done: bar.advance(to=done), network=task.network

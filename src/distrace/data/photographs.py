@@ -66,7 +66,7 @@ def load_photographs(folder: Path) -> Photographs:
     placed = []
     for view in views:
         camera = placement.camera_to_unit(view.camera)
-        single = replace(camera, intrinsics=camera.intrinsics.float(), T_world_camera=camera.T_world_camera.float())
+        single = camera.float()
         placed.append(replace(view, camera=single))
     return Photographs(tuple(placed), placement, frames.layout, frames.placement is not None)
 

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from distrace.data.points import radius_of, thinned
 from distrace.rays import Rays
+from distrace.vectors import perpendicular
 
 AXES = {"x": (1, 0, 0), "y": (0, 1, 0), "z": (0, 0, 1), "-x": (-1, 0, 0), "-y": (0, -1, 0), "-z": (0, 0, -1)}
 FLOOR_THICKNESS = 0.02  # of the radius
@@ -86,8 +87,7 @@ def find_floor(points: Float[Tensor, "n 3"], up: Up) -> Floor | None:
 def rays_below(floor: Floor, points: Float[Tensor, "n 3"]) -> Rays:
     """Returns level rays just below the floor, under the object: nothing of it is there."""
     random = torch.Generator().manual_seed(0)
-    side = torch.linalg.cross(floor.normal, floor.normal.roll(1) + 0.1)
-    side = side / side.norm()
+    side = perpendicular(floor.normal)
     level = torch.stack([side, torch.linalg.cross(floor.normal, side)])
     angles = 2 * np.pi * torch.rand(FLOOR_RAYS, generator=random)
     directions = angles.cos()[:, None] * level[0] + angles.sin()[:, None] * level[1]

@@ -17,6 +17,7 @@ from distrace.surface import minimum
 from distrace.tracing.bounds import Occupancy
 from distrace.tracing.sphere_tracing import Trace
 from distrace.tracing.tracer import TracerConfig, trace_rays
+from distrace.vectors import perpendicular
 
 CURVATURE_STEP = 0.015  # from a hit to where normals tell how the surface bends: a decoder's facets are smaller
 CORE = 0.5  # of the unit sphere: rays that miss the sphere are drawn to within
@@ -137,7 +138,7 @@ class _Here:
         Bends are differences over CURVATURE_STEP: a ReLU network has none but at its facets' edges.
         """
         normal, ray = normalize(self.gradient[where], dim=-1), self.directions[where]
-        side = normalize(torch.linalg.cross(normal, normal.roll(1, -1) + 0.1), dim=-1)
+        side = perpendicular(normal)
         tangents = torch.stack([side, torch.linalg.cross(normal, side)], dim=1)
         _, around = value_and_gradient(
             sdf, self.points[where, None] + CURVATURE_STEP * torch.cat([tangents, -tangents], dim=1)

@@ -212,7 +212,7 @@ def minimised(
             prior,
             sample,
             deviation,
-            beliefs=(),
+            placement_priors=(),
             tilt=0.0,
             samples=stage.samples,
             moves=False,

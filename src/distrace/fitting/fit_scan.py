@@ -17,8 +17,8 @@ from distrace.fields.precision import fastest
 from distrace.fitting.judge import Verdict, judged
 from distrace.fitting.placement_network import PlacementNetwork
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
-from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem, ScanSample
-from distrace.fitting.scan_starts import Starts, belief_of, find_starts
+from distrace.fitting.scan_residuals import PlacedCode, PlacementPrior, ScanProblem, ScanSample
+from distrace.fitting.scan_starts import Starts, find_starts, placement_prior
 from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.pose import Similarity
 from distrace.prior import Prior
@@ -84,24 +84,43 @@ def fit_scan(
     quick = fastest(decoder)
     random = torch.Generator().manual_seed(config.seed)
 
-    def problem_of(stage: Round, beliefs: Sequence[Belief]) -> ScanProblem:
+    def problem_of(stage: Round, placement_priors: Sequence[PlacementPrior]) -> ScanProblem:
         sample = ScanSample.drawn(scan, stage.points, stage.rays, random)
         deviation = (stage.deviation**2 * scan.radius**2 + scan.noise**2) ** 0.5
         return ScanProblem(
-            quick, prior, sample, deviation, beliefs, scan.tilt, stage.samples, place is None, margin=stage.margin
+            quick,
+            prior,
+            sample,
+            deviation,
+            placement_priors,
+            scan.tilt,
+            stage.samples,
+            place is None,
+            margin=stage.margin,
         )
 
     if start is None:
         starts = find_starts(scan, prior, quick, network, place, partial(problem_of, SCREENING), config.seed)
     else:
-        starts = Starts([start], [belief_of(start.place, scan)])
-    ends = run_rounds(starts.states, config.rounds, partial(problem_of, beliefs=starts.beliefs), SOLVER, progress)
-    belief = starts.beliefs[ends.states[0].start]
-    return _fitted(decoder, scan, prior, ends, starts.evaluations, belief.surprise(ends.states[0].place), began)
+        starts = Starts([start], [placement_prior(start.place, scan)])
+    ends = run_rounds(
+        starts.states, config.rounds, partial(problem_of, placement_priors=starts.placement_priors), SOLVER, progress
+    )
+    prior_deviation = None
+    if network is not None and place is None and len(scan.ups):
+        best = ends.states[0]
+        prior_deviation = starts.placement_priors[best.start].prior_deviation(best.place)
+    return _fitted(decoder, scan, prior, ends, starts.evaluations, prior_deviation, began)
 
 
 def _fitted(
-    decoder: Decoder, scan: Scan, prior: Prior, ends: Ends, evaluations: int, surprise: float, began: float
+    decoder: Decoder,
+    scan: Scan,
+    prior: Prior,
+    ends: Ends,
+    evaluations: int,
+    prior_deviation: float | None,
+    began: float,
 ) -> ScanFit:
     least, best = ends.losses[0], ends.states[0]
     codes = [state.code(prior) for state in ends.states]
@@ -109,6 +128,6 @@ def _fitted(
     equal = [k for k, loss in enumerate(ends.losses) if k and loss <= (1 + EQUAL) * least]
     others = tuple((codes[k], ends.states[k].place) for k in equal)
     placed = [(decoder.field(code), place) for code, place in others]
-    verdict = judged(scan, sdf, best.place, placed, surprise=surprise)
+    verdict = judged(scan, sdf, best.place, placed, prior_deviation=prior_deviation)
     seconds = time.perf_counter() - began
     return ScanFit(codes[0], best.place, least, verdict, ends.curves, evaluations + ends.evaluations, seconds, others)

@@ -22,7 +22,7 @@ SEEN = (0.65, 0.1)  # share of its length along each axis that was seen, of what
 SURFACE_POINTS = 500
 OUTER = (0.02, 0.98)  # quantiles between which points or a surface span
 TRUSTED = (0.9, 0.1, 0.05)  # least explained, most blocked, most disagreement
-MOST_SURPRISE = 4.0  # deviations, of what is trusted: 2.4 of the placement network's own
+MOST_PRIOR_DEVIATION = 4.0  # of what is trusted, in units of the placement prior's deviations
 FAILED = (0.7, 0.2)  # least explained, most blocked
 SILHOUETTE = (0.85, 0.6)  # least intersection over union of what is trusted, and of what has not failed
 
@@ -37,7 +37,9 @@ class Verdict:
     seen: float  # share of the shape's length that the points span, along the axis where it is least
     disagreement: float  # how far the other good ends lie from the surface, in sizes; 0 where there are none
     silhouette: float | None  # intersection over union with the mask, where that is the object's alone
-    surprise: float | None  # deviations of size or centre from what was likely; None where the placement is known
+    prior_deviation: (
+        float | None
+    )  # deviations of size or centre from what was likely; None where the placement is known
     reason: str
 
     def facts(self) -> dict[str, float | str | None]:
@@ -48,7 +50,9 @@ class Verdict:
             "extent_seen": round(self.seen, 4),
             "disagreement": round(self.disagreement, 4),
             "silhouette_iou": self.silhouette if self.silhouette is None else round(self.silhouette, 4),
-            "placement_surprise": self.surprise if self.surprise is None else round(self.surprise, 2),
+            "placement_deviation": self.prior_deviation
+            if self.prior_deviation is None
+            else round(self.prior_deviation, 2),
             "reason": self.reason,
         }
 
@@ -60,9 +64,12 @@ def judged(
     place: Similarity,
     others: Sequence[tuple[SDF, Similarity]] = (),
     silhouette: float | None = None,
-    surprise: float | None = None,
+    prior_deviation: float | None = None,
 ) -> Verdict:
-    """Returns the verdict on a placed shape; `others` are the placed shapes of fits that are nearly as good."""
+    """Returns the verdict on a placed shape; `others` are the placed shapes of fits that are nearly as good.
+
+    `prior_deviation` is that of its size or centre from the placement prior.
+    """
     surface = points_on_zero_set(sdf, SURFACE_POINTS, scan.points)
     disagreement = disagreement_of(place.to_world(surface), place, others)
     reach = _reach(surface)
@@ -81,7 +88,7 @@ def judged(
         reasons.append(f"another fit that is as good lies {disagreement:.0%} of the size away")
     if seen < SEEN[0]:
         reasons.append(f"the points span {seen:.0%} of its length along one axis: the rest is a guess")
-    if surprise is not None and surprise > MOST_SURPRISE:
+    if prior_deviation is not None and prior_deviation > MOST_PRIOR_DEVIATION:
         reasons.append("objects of the class that look like that are usually of another size, or elsewhere")
     overlap = 1.0 if silhouette is None else silhouette
     if overlap < SILHOUETTE[0]:
@@ -93,7 +100,9 @@ def judged(
         usual += f"it blocks {blocked:.0%} of the rays of free space"
     else:
         usual += "no free space is known"
-    return Verdict(name, explained, blocked, seen, disagreement, silhouette, surprise, "; ".join(reasons) or usual)
+    return Verdict(
+        name, explained, blocked, seen, disagreement, silhouette, prior_deviation, "; ".join(reasons) or usual
+    )
 
 
 def _have_inside(points: Float[Tensor, "n 3"], sdf: SDF) -> Bool[Tensor, "n"]:

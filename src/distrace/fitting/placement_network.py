@@ -19,24 +19,26 @@ from torch.nn.functional import normalize
 from distrace.checkpoints.model import model_folder
 from distrace.data.scan import Scan
 from distrace.errors import error_context
+from distrace.files import atomic_write
 from distrace.pose import Similarity
 from distrace.rays import Rays
+from distrace.vectors import perpendicular
 
-FILE = "placement.safetensors"  # in a model's folder
-TURNS = 72  # of which each has its probability
+PLACEMENT_FILE = "placement.safetensors"  # in a model's folder
+TURN_BINS = 72  # of which each has its probability
 CELLS = 40  # along each side of the grid
 SLICES = 8  # of height
 REACH = 1.6  # from the middle to the border of the grid, in radii of the scan
 RAY_SAMPLES = 4  # points of free space on each ray
-UNTIL = 0.03  # radii before a ray's end, from where space may not be free
+FREE_MARGIN = 0.03  # radii before a ray's end, from where space may not be free
 POINTS = 768  # of the surface in a grid, at most, and as many rays
-DRAWS = 6  # grids of a scan, of other points, whose answers are averaged
-DRAW_TURN = 1  # turns of the grid, between one draw and the next of three
-NEAR = 3  # turns beside a likely one that lead to the same end
+RESAMPLINGS = 6  # grids of a scan, of other points, whose answers are averaged
+RESAMPLING_TURN = 1  # turns of the grid, between one draw and the next of three
+SUPPRESSED_BINS = 3  # turns beside a likely one that lead to the same end
 
 
 @dataclass(frozen=True)
-class Frame:
+class GridFrame:
     """Where grids lie: axes (right, up, towards the viewer) as columns, middle and unit of length, of each."""
 
     axes: Float[Tensor, "b 3 3"]
@@ -44,11 +46,11 @@ class Frame:
     radius: Float[Tensor, "b"]
 
     @staticmethod
-    def facing(up: Float[Tensor, "b 3"], ahead: Float[Tensor, "b 3"], centre: Tensor, radius: Tensor) -> "Frame":
+    def facing(up: Float[Tensor, "b 3"], ahead: Float[Tensor, "b 3"], centre: Tensor, radius: Tensor) -> "GridFrame":
         """Returns upright frames whose z axis points against `ahead`."""
         level = ahead - (ahead * up).sum(-1, keepdim=True) * up
         back = -normalize(level, dim=-1)
-        return Frame(torch.stack([torch.linalg.cross(up, back), up, back], dim=-1), centre, radius)
+        return GridFrame(torch.stack([torch.linalg.cross(up, back), up, back], dim=-1), centre, radius)
 
     def points(self, points: Float[Tensor, "b n 3"]) -> Float[Tensor, "b n 3"]:
         return (points - self.centre[:, None]) @ self.axes / self.radius[:, None, None]
@@ -58,7 +60,7 @@ class Frame:
 
 
 def grids_of(
-    frame: Frame,
+    frame: GridFrame,
     points: Float[Tensor, "b n 3"],
     known: Bool[Tensor, "b n"],
     rays: Rays,
@@ -76,7 +78,7 @@ def grids_of(
     nearest = (origins + middle[..., None] * directions).square().sum(-1)
     half = (1.5 * REACH**2 - nearest).clamp_min(0).sqrt()
     near = (middle - half).clamp_min(0)
-    far = torch.minimum(middle + half, until / frame.radius[:, None] - UNTIL)
+    far = torch.minimum(middle + half, until / frame.radius[:, None] - FREE_MARGIN)
     shares = (torch.arange(RAY_SAMPLES) + torch.rand(*near.shape, RAY_SAMPLES, generator=random)) / RAY_SAMPLES
     t = near[..., None] + (far - near)[..., None] * shares.to(near)
     samples = origins[:, :, None] + t.nan_to_num(0.0)[..., None] * directions[:, :, None]
@@ -110,7 +112,7 @@ class PlacementNetwork(nn.Module):
         widths = ((2 * SLICES, 32, 2), (32, 64, 2), (64, 96, 1), (96, 128, 2), (128, 128, 1))  # in, out, stride
         self.body = nn.Sequential(*(_convolution(*width) for width in widths))
         self.head = nn.Sequential(nn.Flatten(), nn.Dropout(0.1), nn.Linear(128 * (CELLS // 8) ** 2, 256), nn.ReLU())
-        self.turn = nn.Linear(256, TURNS)
+        self.turn = nn.Linear(256, TURN_BINS)
         self.place = nn.Linear(256, 12)
 
     def forward(
@@ -138,19 +140,26 @@ class PlacementGuess:
 
     def places(self, count: int) -> list[Similarity]:
         """Returns the most likely placements, best first, each of another turn."""
-        step = 2 * math.pi / TURNS
-        smooth = self.turns + self.turns.roll(1) + self.turns.roll(-1)
-        beside = torch.arange(-2, 3)
         found = []
-        for _ in range(count):
-            best = int(smooth.argmax())
-            weights = self.turns[(best + beside) % TURNS]
-            offset = float((weights * beside).sum() / weights.sum().clamp_min(1e-9))
-            turn = self.centre.new_tensor([0.0, (best + offset) * step, 0.0])
-            rotation = self.up_frame @ roma.rotvec_to_rotmat(turn)
+        for turn in likeliest_turns(self.turns[None], count)[0]:
+            rotation = self.up_frame @ roma.rotvec_to_rotmat(turn * turn.new_tensor([0.0, 1.0, 0.0]))
             found.append(Similarity(rotation, self.centre, self.size))
-            smooth[(best + torch.arange(-NEAR, NEAR + 1)) % TURNS] = -1.0
         return found
+
+
+def likeliest_turns(probabilities: Float[Tensor, "b turns"], count: int) -> Float[Tensor, "b count"]:
+    """Returns the peaks of distributions of turns, in radians, best first; they are at least 20 degrees apart."""
+    smooth = probabilities + probabilities.roll(1, -1) + probabilities.roll(-1, -1)
+    beside = torch.arange(-2, 3).to(smooth.device)
+    suppressed = torch.arange(-SUPPRESSED_BINS, SUPPRESSED_BINS + 1).to(smooth.device)
+    found = []
+    for _ in range(count):
+        best = smooth.argmax(-1, keepdim=True)
+        weights = probabilities.gather(-1, (best + beside) % TURN_BINS)
+        offset = (weights * beside).sum(-1) / weights.sum(-1).clamp_min(1e-9)
+        found.append((best[:, 0] + offset) * (2 * math.pi / TURN_BINS))
+        smooth = smooth.scatter(-1, (best + suppressed) % TURN_BINS, -1.0)
+    return torch.stack(found, dim=-1)
 
 
 @torch.no_grad()
@@ -158,16 +167,18 @@ def guess_placement(network: PlacementNetwork, scan: Scan, up: Float[Tensor, "3"
     """Returns the guess for an object whose own up is near `up`."""
     random = torch.Generator().manual_seed(seed)
     ahead = _ahead(scan, up)
-    shifts = [DRAW_TURN * (draw % 3 - 1) for draw in range(DRAWS)]
-    about = torch.tensor(shifts)[:, None] * (2 * math.pi / TURNS) * up
+    shifts = [RESAMPLING_TURN * (draw % 3 - 1) for draw in range(RESAMPLINGS)]
+    about = torch.tensor(shifts)[:, None] * (2 * math.pi / TURN_BINS) * up
     directions = torch.einsum("bij,j->bi", roma.rotvec_to_rotmat(about), ahead)
-    centres = scan.centre.expand(DRAWS, 3)
-    frame = Frame.facing(up.expand(DRAWS, 3), directions, centres, scan.points.new_full((DRAWS,), scan.radius))
+    centres = scan.centre.expand(RESAMPLINGS, 3)
+    frame = GridFrame.facing(
+        up.expand(RESAMPLINGS, 3), directions, centres, scan.points.new_full((RESAMPLINGS,), scan.radius)
+    )
     logits, mean, log_deviation = network(_drawn_grids(scan, frame, random))
     each = logits.softmax(-1)
     turns = torch.stack([one.roll(shift) for one, shift in zip(each, shifts, strict=True)]).mean(0)
     axes = frame.axes[1]  # of the draw that is not turned
-    tilt = torch.zeros(DRAWS, 3)
+    tilt = torch.zeros(RESAMPLINGS, 3)
     tilt[:, [0, 2]] = mean[:, 4:]
     tilt = torch.einsum("bij,bj->bi", frame.axes, tilt).mean(0) @ axes  # its y is about 0
     centre = torch.einsum("bij,bj->bi", frame.axes, mean[:, :3]).mean(0)
@@ -183,9 +194,9 @@ def guess_placement(network: PlacementNetwork, scan: Scan, up: Float[Tensor, "3"
     )
 
 
-def _drawn_grids(scan: Scan, frame: Frame, random: torch.Generator) -> Float[Tensor, "b channels cells cells"]:
-    points = torch.stack([_rows(len(scan.points), random) for _ in range(DRAWS)])
-    rays = torch.stack([_rows(len(scan.free_until), random) for _ in range(DRAWS)])
+def _drawn_grids(scan: Scan, frame: GridFrame, random: torch.Generator) -> Float[Tensor, "b channels cells cells"]:
+    points = torch.stack([_rows(len(scan.points), random) for _ in range(RESAMPLINGS)])
+    rays = torch.stack([_rows(len(scan.free_until), random) for _ in range(RESAMPLINGS)])
     known = torch.ones_like(points, dtype=torch.bool)
     return grids_of(frame, scan.points[points], known, scan.free[rays], scan.free_until[rays], random)
 
@@ -196,7 +207,7 @@ def _rows(count: int, random: torch.Generator) -> Tensor:
 
 def _ahead(scan: Scan, up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
     """Returns the level direction from the viewer to the object; of a cloud, any."""
-    side = torch.linalg.cross(up, up.roll(1) + 0.1)
+    side = perpendicular(up)
     if not scan.views:
         return side
     ahead = scan.centre - scan.views[0].camera.T_world_camera[:3, 3]
@@ -206,7 +217,7 @@ def _ahead(scan: Scan, up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
 
 def load_placement_network(model: str | Path) -> PlacementNetwork | None:
     """Returns the network of a bundled model or of a folder; None where it has none. Raises `ValueError` for damage."""
-    path = model_folder(model) / FILE
+    path = model_folder(model) / PLACEMENT_FILE
     if not path.is_file():
         return None
     network = PlacementNetwork()
@@ -215,3 +226,12 @@ def load_placement_network(model: str | Path) -> PlacementNetwork | None:
         if not all(tensor.isfinite().all() for tensor in network.state_dict().values()):
             raise ValueError("it has values that are not finite")
     return network.eval().requires_grad_(False)
+
+
+def save_placement_network(path: Path, network: PlacementNetwork) -> None:
+    """Writes a placement network in half precision, as a model's folder has it."""
+    tensors: dict[str, Tensor] = {}
+    for name, tensor in network.state_dict().items():
+        tensors[name] = (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
+    with atomic_write(path) as file:
+        file.write(safetensors.torch.save(tensors))

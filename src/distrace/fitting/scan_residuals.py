@@ -38,12 +38,17 @@ class PlacedCode:
     w: Float[Tensor, "dimensions"]  # added, in leading coordinates of the prior
     place: Similarity
 
+    @staticmethod
+    def at(place: Similarity, base: Float[Tensor, "length"], start: int = 0) -> "PlacedCode":
+        """Returns a code as it is, at a placement."""
+        return PlacedCode(start, base, base[:0], place)
+
     def code(self, prior: Prior) -> Float[Tensor, "length"]:
         return self.base + prior.basis[:, : len(self.w)] @ self.w
 
 
 @dataclass(frozen=True)
-class Belief:
+class PlacementPrior:
     """Where a start is likely to end: Gaussians of its size, its centre and its own up."""
 
     size: float
@@ -52,7 +57,7 @@ class Belief:
     size_deviation: float = GROWTH  # of the logarithm
     centre_deviation: float = torch.inf  # in sizes, along each axis
 
-    def surprise(self, place: Similarity) -> float:
+    def prior_deviation(self, place: Similarity) -> float:
         """Returns how many deviations a placement is away, by its size or by its centre."""
         size = abs(float((place.scale / self.size).log())) / self.size_deviation
         shift = (place.translation - self.centre).square().mean().sqrt() / self.size
@@ -92,7 +97,7 @@ class ScanProblem:
     prior: Prior
     sample: ScanSample
     deviation: float  # in the scan's unit
-    beliefs: Sequence[Belief]  # of each start; none where the placement is known
+    placement_priors: Sequence[PlacementPrior]  # of each start; none where the placement is known
     tilt: float
     samples: int  # on each ray, at which its least value is sought
     moves: bool = True  # whether the placement is unknown
@@ -182,32 +187,32 @@ class ScanProblem:
             far = (sample.distances.abs() > FAR) & (values[:count] * sample.distances.sign() > FAR)
             off[:count][far] = 0.0
             jacobian[:count][far] = 0.0
-        beliefs, by_unknowns = self._beliefs(state)
+        placement_priors, by_unknowns = self._prior_residuals(state)
         return Residuals(
-            torch.cat([off, PRIOR_SCALE * beliefs]),
+            torch.cat([off, PRIOR_SCALE * placement_priors]),
             torch.cat([jacobian, PRIOR_SCALE * by_unknowns]),
-            torch.cat([weights, torch.full_like(beliefs, PRIOR_SCALE**-2)]),
+            torch.cat([weights, torch.full_like(placement_priors, PRIOR_SCALE**-2)]),
         )
 
-    def _beliefs(self, state: PlacedCode) -> tuple[Tensor, Tensor]:
+    def _prior_residuals(self, state: PlacedCode) -> tuple[Tensor, Tensor]:
         """Returns what the prior says, in standard deviations, and its derivatives by all unknowns."""
         count = len(state.w)
         w, place = state.w, state.place
         if not self.moves:
             return w / self.code_deviation, torch.eye(count).to(w) / self.code_deviation
-        belief = self.beliefs[state.start]
-        growth = (place.scale / belief.size).log()[None] / belief.size_deviation
-        unit = belief.centre_deviation * belief.size
-        shift = (place.translation - belief.centre) / unit
+        likely = self.placement_priors[state.start]
+        growth = (place.scale / likely.size).log()[None] / likely.size_deviation
+        unit = likely.centre_deviation * likely.size
+        shift = (place.translation - likely.centre) / unit
         tilt = w.new_zeros(0)
         by_turn = w.new_zeros(0, 3)
-        if belief.up is not None:
+        if likely.up is not None:
             axis = place.rotation[:, 1]
-            tilt = torch.linalg.cross(axis, belief.up) / self.tilt
-            by_turn = (axis[:, None] * belief.up[None] - (axis @ belief.up) * torch.eye(3).to(w)) / self.tilt
+            tilt = torch.linalg.cross(axis, likely.up) / self.tilt
+            by_turn = (axis[:, None] * likely.up[None] - (axis @ likely.up) * torch.eye(3).to(w)) / self.tilt
         derivatives = w.new_zeros(count + 4 + len(tilt), count + 7)
         derivatives[:count, :count] = torch.eye(count) / self.code_deviation
-        derivatives[count, count + 6] = 1 / belief.size_deviation
+        derivatives[count, count + 6] = 1 / likely.size_deviation
         derivatives[count + 1 : count + 4, count + 3 : count + 6] = torch.eye(3).to(w) * (place.scale / unit)
         derivatives[count + 4 :, count : count + 3] = by_turn
         return torch.cat([w / self.code_deviation, growth, shift, tilt]), derivatives

@@ -1,4 +1,4 @@
-"""Where a fit to a scan starts: at the placements that a network finds likely, or at places all about the scan."""
+"""Where a fit to a scan starts: at placements that a network finds likely, or turned and sized in many ways."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -14,19 +14,20 @@ from distrace.data.scan import Scan
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import BFloat16Decoder
 from distrace.fitting.placement_network import PlacementGuess, PlacementNetwork, guess_placement
-from distrace.fitting.scan_residuals import Belief, PlacedCode, ScanProblem, ScanSample
+from distrace.fitting.scan_residuals import PlacedCode, PlacementPrior, ScanProblem, ScanSample
 from distrace.fitting.solver import charbonnier
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
 from distrace.prior import Prior
+from distrace.vectors import perpendicular
 
 LIKELY = 6  # placements of the mean shape that the fit starts from
 NEAREST = 2  # starts from the training shapes that are nearest to the scan, …
 NEAREST_PLACES = 2  # … at each of the likeliest placements
 HINT_POINTS = 80  # of the surface, and of free space, that tell which are nearest
 HINT_MARGIN = 0.05  # radii of the unit sphere before the end of a ray, from where space may not be free
-TURNS = 12  # about up, without a network
-SIZES = (1.05, 1.4)  # of the unit sphere, in radii of the scan, without a network
+TRIED_TURNS = 12  # about up, without a network
+TRIED_SIZES = (1.05, 1.4)  # of the unit sphere, in radii of the scan, without a network
 DEVIATION_FACTOR = 0.6  # × the network's deviations: residuals of points are not as independent as they count
 LEAST_DEVIATION = 0.02
 
@@ -36,24 +37,24 @@ class Starts:
     """Where to start, and where each start is likely to end; states are numbered from 0."""
 
     states: list[PlacedCode]
-    beliefs: list[Belief]
+    placement_priors: list[PlacementPrior]
     evaluations: int = 0  # of the field
 
     def __add__(self, other: "Starts") -> "Starts":
         states = [*self.states, *other.states]
         numbered = [replace(state, start=number) for number, state in enumerate(states)]
-        return Starts(numbered, [*self.beliefs, *other.beliefs], self.evaluations + other.evaluations)
+        return Starts(numbered, [*self.placement_priors, *other.placement_priors], self.evaluations + other.evaluations)
 
-    def best(self, count: int, problem_of: Callable[[Sequence[Belief]], ScanProblem]) -> "Starts":
+    def best(self, count: int, problem_of: Callable[[Sequence[PlacementPrior]], ScanProblem]) -> "Starts":
         """Returns the `count` states of the least loss."""
         if len(self.states) <= count:
             return self
-        problem = problem_of(self.beliefs)
+        problem = problem_of(self.placement_priors)
         losses = torch.tensor([each.loss(1.0, charbonnier) for each in problem.residuals(self.states)])
         chosen = losses.argsort()[:count].tolist()
         states = [replace(self.states[k], start=number) for number, k in enumerate(chosen)]
         evaluations = self.evaluations + sum(problem.evaluations.values())
-        return Starts(states, [self.beliefs[k] for k in chosen], evaluations)
+        return Starts(states, [self.placement_priors[k] for k in chosen], evaluations)
 
 
 def find_starts(
@@ -62,7 +63,7 @@ def find_starts(
     decoder: Decoder | BFloat16Decoder,
     network: PlacementNetwork | None,
     place: Similarity | None,
-    problem_of: Callable[[Sequence[Belief]], ScanProblem],
+    problem_of: Callable[[Sequence[PlacementPrior]], ScanProblem],
     seed: int,
 ) -> Starts:
     """Returns the mean shape at likely placements, or at `place`, and the nearest training shapes at the best of them.
@@ -70,17 +71,17 @@ def find_starts(
     `problem_of` takes what is likely of the states that are compared.
     """
     if place is not None:
-        places = Starts([PlacedCode(0, prior.mean, prior.mean[:0], place)], [belief_of(place, scan)])
+        places = Starts([PlacedCode.at(place, prior.mean)], [placement_prior(place, scan)])
     elif network is not None:
         places = _of_network(scan, prior, network, seed).best(LIKELY, problem_of)
     else:
         places = _all_about(scan, prior).best(2 * LIKELY, problem_of)
     nearest = Starts([], [])
-    for state, belief in list(zip(places.states, places.beliefs))[:NEAREST_PLACES]:
+    for state, likely in list(zip(places.states, places.placement_priors))[:NEAREST_PLACES]:
         hints = _hints(scan, state.place, seed)
         codes, evaluations = nearest_codes(decoder, prior.codes, hints, NEAREST)
-        states = [PlacedCode(0, code, prior.mean[:0], state.place) for code in codes]
-        nearest += Starts(states, [belief] * len(states), evaluations)
+        states = [PlacedCode.at(state.place, code) for code in codes]
+        nearest += Starts(states, [likely] * len(states), evaluations)
     return places + nearest
 
 
@@ -93,15 +94,15 @@ def _hints(scan: Scan, place: Similarity, seed: int) -> Hints:
     return Hints.of(ScanSample(place.to_object(sample.points), rays, until, sample.free), random)
 
 
-def belief_of(place: Similarity, scan: Scan, guess: PlacementGuess | None = None) -> Belief:
+def placement_prior(place: Similarity, scan: Scan, guess: PlacementGuess | None = None) -> PlacementPrior:
     """Returns what is likely of an end: a guess's centre and size, and the candidate of up that the start has."""
     axis = place.rotation[:, 1]
     up = scan.ups[(scan.ups @ axis).argmax()] if len(scan.ups) else None
-    belief = Belief(float(place.scale), place.translation, up)
+    likely = PlacementPrior(float(place.scale), place.translation, up)
     if guess is None:
-        return belief
+        return likely
     return replace(
-        belief,
+        likely,
         size_deviation=max(DEVIATION_FACTOR * guess.size_deviation, LEAST_DEVIATION),
         centre_deviation=max(DEVIATION_FACTOR * guess.centre_deviation, LEAST_DEVIATION),
     )
@@ -110,36 +111,43 @@ def belief_of(place: Similarity, scan: Scan, guess: PlacementGuess | None = None
 def _of_network(scan: Scan, prior: Prior, network: PlacementNetwork, seed: int) -> Starts:
     """Returns the mean shape at the likeliest placements, the best of each up first."""
     states = []
-    beliefs = []
-    for up in scan.ups if len(scan.ups) else axes_around().to(scan.points):
-        guess = guess_placement(network, scan.to("cpu"), up.cpu(), seed)
+    placement_priors = []
+    on_cpu = scan.to("cpu")
+    for up in _candidate_ups(on_cpu):
+        guess = guess_placement(network, on_cpu, up, seed)
         for place in guess.places(LIKELY):
             place = place.to(prior.mean.device)
-            states.append(PlacedCode(len(states), prior.mean, prior.mean[:0], place))
-            beliefs.append(belief_of(place, scan, guess))
-    return Starts(states, beliefs)
+            states.append(PlacedCode.at(place, prior.mean, len(states)))
+            placement_priors.append(
+                placement_prior(place, scan, guess if len(scan.ups) else None)
+            )  # it knows upright objects
+    return Starts(states, placement_priors)
 
 
 def _all_about(scan: Scan, prior: Prior) -> Starts:
     """Returns the mean shape in all turns about up, in two sizes, about the middle of the scan."""
     states = []
-    beliefs = []
-    for up in scan.ups if len(scan.ups) else axes_around().to(scan.points):
+    placement_priors = []
+    for up in _candidate_ups(scan):
         for rotation in turns_about(up):
             along = scan.points @ rotation
             middle = rotation @ (along.quantile(0.02, dim=0) + along.quantile(0.98, dim=0)) / 2
-            for size in SIZES:
+            for size in TRIED_SIZES:
                 place = Similarity(rotation, middle, middle.new_tensor(size * scan.radius))
-                states.append(PlacedCode(len(states), prior.mean, prior.mean[:0], place))
-                beliefs.append(belief_of(place, scan))
-    return Starts(states, beliefs)
+                states.append(PlacedCode.at(place, prior.mean, len(states)))
+                placement_priors.append(placement_prior(place, scan))
+    return Starts(states, placement_priors)
+
+
+def _candidate_ups(scan: Scan) -> Float[Tensor, "k 3"]:
+    return scan.ups if len(scan.ups) else axes_around().to(scan.points)
 
 
 def turns_about(up: Float[Tensor, "3"]) -> Float[Tensor, "turns 3 3"]:
     """Returns rotations that take the y axis to `up`."""
-    side = normalize(torch.linalg.cross(up, up.roll(1) + 0.1), dim=-1)
+    side = perpendicular(up)
     upright = torch.stack([torch.linalg.cross(up, side), up, side], dim=1)
-    angles = torch.arange(TURNS).to(up) * (2 * math.pi / TURNS)
+    angles = torch.arange(TRIED_TURNS).to(up) * (2 * math.pi / TRIED_TURNS)
     return upright @ roma.rotvec_to_rotmat(angles[:, None] * angles.new_tensor([0.0, 1.0, 0.0]))
 
 

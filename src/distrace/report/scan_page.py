@@ -48,10 +48,10 @@ def scan_page(
     evidence = [
         ("points near the surface", f"{verdict.explained:.1%}"),
         ("rays of free space that pass through the shape", f"{verdict.blocked:.1%}"),
-        ("distance of the other good fits, in radii of the unit sphere", f"{verdict.disagreement:.3f}"),
+        ("distance of the other good fits, in sizes", f"{verdict.disagreement:.3f}"),
     ]
-    if verdict.surprise is not None:
-        evidence.append(("deviations from the likely size and centre", f"{verdict.surprise:.1f}"))
+    if verdict.prior_deviation is not None:
+        evidence.append(("deviations from the likely size and centre", f"{verdict.prior_deviation:.1f}"))
     turn = place.rotation.double().numpy()  # rows of the input's axes, columns of the object's
     if truth is not None:
         truth = truth @ turn if isinstance(truth, np.ndarray) else _turned(truth, turn)

@@ -81,7 +81,7 @@ def _refit(scene: Scene, scan: Scan, place: Similarity) -> Refit:
     config = ScanFitConfig(rounds=ScanFitConfig().rounds[-1:])
 
     def refit(code: Float[Tensor, "length"], progress: Progress) -> tuple[Float[Tensor, "length"], str]:
-        start = PlacedCode(0, code, prior.mean[:0], place.to(code.device))
+        start = PlacedCode.at(place.to(code.device), code)
         here = scan.to(code.device)
 
         def report(done: int) -> None:
@@ -103,7 +103,7 @@ def _photographed(folder: Path, content: dict[str, Any]) -> list[Camera]:
         unit = placement_of(sphere["centre"], sphere["radius"])
         place = Similarity.from_matrix(torch.tensor(content["T_unit_object"]))
     cameras = read_cameras(folder / "transforms.json")
-    return [place.camera_in_object(unit.camera_to_unit(camera)) for camera in cameras]
+    return [place.camera_in_object(unit.camera_to_unit(camera).float()) for camera in cameras]
 
 
 def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device) -> Scene:
@@ -117,7 +117,7 @@ def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device)
         unit = placement_of(sphere["centre"], sphere["radius"])
     cameras: list[Camera] = []
     if (folder / "transforms.json").is_file():
-        cameras = [unit.camera_to_unit(camera) for camera in read_cameras(folder / "transforms.json")]
+        cameras = [unit.camera_to_unit(camera).float() for camera in read_cameras(folder / "transforms.json")]
     field = surface.requires_grad_(False).eval().to(device)
     return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit.similarity, device=device)
 

@@ -105,7 +105,7 @@ def save_cameras(path: Path, cameras: Mapping[Path, Camera]) -> None:
         pose = camera.T_world_camera.cpu().double().numpy() @ OPENGL
         frames.append(
             {
-                "file_path": Path(os.path.relpath(file.resolve(), folder)).as_posix(),
+                "file_path": Path(os.path.relpath(file.parent.resolve() / file.name, folder)).as_posix(),
                 "w": camera.width,
                 "h": camera.height,
                 "fl_x": intrinsics[0][0],
@@ -119,7 +119,7 @@ def save_cameras(path: Path, cameras: Mapping[Path, Camera]) -> None:
 
 
 def read_cameras(path: Path) -> list[Camera]:
-    """Reads the cameras alone, without their images. Raises `ValueError` as `read` does."""
+    """Reads the cameras alone, in double, without their images. Raises `ValueError` as `read` does."""
     content = read_json(path)
     cameras = []
     for number, entry in enumerate(listed(content, "frames", path)):
@@ -127,6 +127,6 @@ def read_cameras(path: Path) -> list[Camera]:
             frame = content | entry
             size = (int(_number(frame, "h")), int(_number(frame, "w")))
             pose = matrix(frame, "transform_matrix", 4, 4) @ OPENGL
-            intrinsics = torch.from_numpy(_intrinsics(frame, *size)).float()
-            cameras.append(Camera.from_matrices(intrinsics, torch.from_numpy(pose).float(), *size))
+            intrinsics = torch.from_numpy(_intrinsics(frame, *size))
+            cameras.append(Camera.from_matrices(intrinsics, torch.from_numpy(pose), *size))
     return cameras
