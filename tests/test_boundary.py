@@ -140,6 +140,7 @@ def test_an_outline_moves_the_pixel_more_whose_centre_is_nearer(at: float) -> No
     torch.testing.assert_close(found, -scale * (1 - (centres - edge).abs()).clamp_min(0), rtol=0, atol=0.02 * scale)
 
 
+@pytest.mark.slow
 def test_of_a_shaded_sphere_hits_and_outline_together_make_the_derivative() -> None:
     """By the closed form of a distant disk's mean: r² · a constant. Hits near a round outline need some averaging."""
 
@@ -250,6 +251,7 @@ def test_rays_without_neighbours_are_refused() -> None:
         shade(buffers, black, WHITE)
 
 
+@pytest.mark.slow
 def test_a_sphere_finds_its_place_from_an_image_alone() -> None:
     """It overlaps the target in part: one side of its outline has to come in, the other to go out."""
     camera = view(24)

@@ -57,6 +57,7 @@ def test_two_views_recover_it_too_and_normals_help() -> None:
     torch.testing.assert_close(step.code, TRUE, atol=0.01, rtol=0)
 
 
+@pytest.mark.slow
 def test_the_silhouette_tells_what_a_depth_leaves_open() -> None:
     """One depth fits spheres of every radius; only the mask knows which.
 
@@ -136,6 +137,7 @@ def test_a_view_from_inside_the_mean_shape_is_refused() -> None:
         next(fit_shape(Spheres(), [view_of(TRUE), View(inside, torch.full((8, 8), 0.3))], PRIOR, CONFIG))
 
 
+@pytest.mark.slow
 def test_normals_alone_tell_where_a_sphere_is() -> None:
     view = view_of(TRUE, mask=False, normal=True)
     known = replace(view, depth=torch.full_like(view.depth, torch.inf))

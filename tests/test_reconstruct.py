@@ -290,6 +290,7 @@ def turned(view: Photograph, degrees: float) -> Photograph:
     return replace(view, camera=replace(view.camera, T_world_camera=turn @ view.camera.T_world_camera))
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_hull")
 def test_a_view_whose_camera_is_turned_is_an_outlier() -> None:
     seen = seen_by(box(torch.tensor([0.1, 0.6, 0.2])), [camera.resized(2.0) for camera in ring(16, 40)])
@@ -298,6 +299,7 @@ def test_a_view_whose_camera_is_turned_is_an_outlier() -> None:
     assert [view.name for view in found if view.is_outlier] == ["02"]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("coarse_hull")
 def test_a_view_that_alone_sees_through_a_hole_is_no_outlier() -> None:
     around = [Camera.orbit(360 * k / 12, 0, 3.0, height=64, width=64, focal_px=80.0) for k in range(12)]
@@ -337,6 +339,7 @@ def test_without_colours_only_outlines_pull(views: list[Photograph]) -> None:
     assert surface.evaluations > 2 * 600
 
 
+@pytest.mark.slow
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(views: list[Photograph], tmp_path: Path) -> None:
     config = replace(SHORT, steps=12, sizes=(16, 32))
     fingerprints = [fingerprint(view) for view in views]

@@ -394,20 +394,24 @@ def counts() -> dict[int, Counter[str]]:
     return {size: counts_of(sofa, poster_view(size)) for size in (64, 512)}
 
 
+@pytest.mark.slow
 def test_all_evaluations_of_the_posters_view_are_reported(counts) -> None:
     assert counts[512]["points"] == counts[512]["evaluations"] > 100_000
 
 
+@pytest.mark.slow
 def test_the_posters_view_takes_few_calls_of_the_field(counts) -> None:
     assert counts[512]["calls"] <= 60
 
 
+@pytest.mark.slow
 def test_the_posters_view_takes_few_operations(counts) -> None:
     rough = fastest_field(load_model("sofas").field(0)) is not None  # else it takes more queries
     assert counts[512]["operations"] <= (1500 if rough else 1700)
     assert counts[512]["next"] <= (1200 if rough else 1400)
 
 
+@pytest.mark.slow
 def test_operations_grow_no_faster_than_the_logarithm_of_the_images_side(counts) -> None:
     assert counts[512]["operations"] / counts[64]["operations"] < np.log(512) / np.log(64)
 

@@ -473,6 +473,7 @@ def assert_same_state(one: dict[str, Tensor], other: dict[str, Tensor]) -> None:
     assert [name for name in one if not torch.equal(one[name], other[name])] == []
 
 
+@pytest.mark.slow
 def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Path, run, monkeypatch) -> None:
     samples, killed, whole = sample_files(tmp_path / "samples", 0.3, 0.6), tmp_path / "killed", tmp_path / "whole"
     program = "import torch; torch.set_num_threads(1); from distrace.cli import main; main()"

@@ -199,6 +199,7 @@ def viewer(tmp_path: Path) -> Iterator["Viewer"]:
     viewer.close()
 
 
+@pytest.mark.slow
 def test_saves_what_is_shown_and_a_page_without_a_server(viewer, tmp_path: Path) -> None:
     assert viewer.address.startswith("http://127.0.0.1:")
     viewer.set_layer("depth")

@@ -149,6 +149,7 @@ def test_spread_correlates_spread_and_error(
     assert -1 <= row["correlation"] <= 1
 
 
+@pytest.mark.slow
 def test_views_measures_analytic_fields_alone_where_no_model_is_named(
     run: Command, capsys: pytest.CaptureFixture, tmp_path: Path
 ) -> None:

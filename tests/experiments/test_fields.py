@@ -91,6 +91,7 @@ def test_every_family_is_drawn_and_no_field_is_steeper_than_its_lipschitz_consta
         assert gradient.norm(dim=-1).max() <= view.lipschitz * 1.001, view.model
 
 
+@pytest.mark.slow
 def test_every_family_but_the_camera_in_the_solid_is_seen(drawn: list[View]) -> None:
     for view in drawn:
         truth = reference_depth(lambda points, view=view: view.sdf(points) / view.lipschitz, view.camera())

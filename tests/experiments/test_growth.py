@@ -21,6 +21,7 @@ def small(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "VIEWS", (1, 3))
 
 
+@pytest.mark.slow
 def test_a_row_for_every_size_strategy_network_and_number_of_views() -> None:
     rows = [*growth.by_size(sphere(0.5), 1), *growth.by_network(1), *growth.by_views(sphere(0.5), 1)]
     assert [row.value for row in rows] == ["16", "16", "32", "32", "2 × 16", "2 × 16", "3 × 16", "3 × 16", "1", "3"]
@@ -48,6 +49,7 @@ def test_views_share_one_occupancy() -> None:
     assert three.queries < 3 * one.queries
 
 
+@pytest.mark.slow
 def test_many_shapes_in_one_call_are_measured_beside_their_evaluations(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth, "SHAPES", (2,))
     whole, evaluations = growth.by_shapes(load_model("sofas"), 1)

@@ -30,6 +30,7 @@ def test_a_curve_measures_some_of_the_steps_and_adds_up_what_all_took() -> None:
     assert [curve.reached(loss) for loss in (5.0, 3.0, 2.0, 0.5)] == [1.0, 1.0, 2.0, None]
 
 
+@pytest.mark.slow
 def test_both_solvers_complete_a_shape_and_their_rows_say_how_fast(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(solvers, "ADAM", replace(solvers.ADAM, iterations=40, mask_rays=200))
     spread = 0.1 * torch.randn(12, 4, generator=torch.Generator().manual_seed(0))
