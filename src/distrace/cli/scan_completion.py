@@ -29,11 +29,10 @@ from distrace.report.scan_page import scan_page
 if TYPE_CHECKING:
     import trimesh
 
-PICTURE = 192  # pixels along the longer side, of what the sensor sees
-SIDE = 128  # pixels, of the other views
+PICTURE = 128  # pixels along the longer side, of what the sensor sees
+SIDE = 96  # pixels, of the other views
 VIEWS = {
     "front": (0, 15),
-    "left": (90, 15),
     "back": (180, 15),
     "above": (30, 60),
 }  # azimuth and elevation, of the object
