@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.scan import Scan, scan_of_view
@@ -15,6 +15,7 @@ from distrace.data.up import Up
 from distrace.errors import error_context
 from distrace.files import atomic_write
 from distrace.fitting.placement_network import POINTS
+from distrace.pixels import rectangle_around
 from experiments.datasets.sensor import Scene, sensed
 from experiments.datasets.solids import solid_of
 from experiments.procedural import procedural_mesh
@@ -79,7 +80,7 @@ class ScanMaker:
             boxed = self.random.uniform() < BOX_SHARE
             if not scene.mask.any():
                 continue
-            mask = self._box(scene.mask) if boxed else scene.mask
+            mask = rectangle_around(scene.mask, self._margins) if boxed else scene.mask
             try:
                 return _stacked(scan_of_view(scene.view, mask, Up.along("y"), boxed), scene, seed)
             except ValueError:  # hardly any pixel of the object has a depth
@@ -94,16 +95,10 @@ class ScanMaker:
             self.solids[shape.name] = solid_of(shape, self.meshes)
         return self.solids[shape.name]
 
-    def _box(self, mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-        """Returns a rectangle about the mask, a little too large."""
-        box = torch.zeros_like(mask)
-        spans = []
-        for axis in (1, 0):
-            occupied = mask.any(axis).nonzero()[:, 0]
-            before, after = self.random.integers(0, BOX_MARGIN + 1, 2)
-            spans.append(slice(max(int(occupied[0] - before), 0), int(occupied[-1] + after) + 1))
-        box[spans[0], spans[1]] = True
-        return box
+    def _margins(self, _length: int) -> tuple[int, int]:
+        """Returns by how many pixels a rectangle is too large, before and after."""
+        before, after = self.random.integers(0, BOX_MARGIN + 1, 2)
+        return int(before), int(after)
 
 
 def _stacked(scan: Scan, scene: Scene, seed: int) -> TrainingScans:

@@ -20,7 +20,6 @@ from distrace.data.solid import Solid, normalised, normalised_frame
 from distrace.data.up import Up
 from distrace.files import save_json
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
-from distrace.fitting.placement_network import load_placement_network
 from distrace.mesh import extract_mesh
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
@@ -30,7 +29,7 @@ from experiments.datasets.solids import solid_of
 from experiments.datasets.splits import shape_of
 from experiments.procedural import procedural_mesh
 from experiments.tables.sparse_depth import held_out
-from experiments.tables.trials import Place, fingerprint, grouped, hash_of, read_json
+from experiments.tables.trials import Place, fingerprint, grouped, hash_of, network_once, read_json
 
 INVENTED = "invented-"  # names of procedural shapes: this and a number
 INVENTED_SEED = 500_000  # of the first; training used those from 0
@@ -104,7 +103,7 @@ def placed(place: Place, trial: PlacedTrial) -> Placed:
     path = place.out / "trials" / trial.file
     model = place.model_of(trial.category)
     config = ScanFitConfig()
-    network = load_placement_network(dict(place.models)[trial.category])
+    network = network_once(dict(place.models)[trial.category])
     mark = fingerprint(model, place.resolution, config, MEASURE, network=network)
     if path.is_file():
         content = read_json(path)

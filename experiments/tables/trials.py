@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from distrace.checkpoints.model import Model, load_model
 from distrace.errors import error_context
 from distrace.fields.base import SDF
+from distrace.fitting.placement_network import PlacementNetwork, load_placement_network
 from distrace.mesh import MeshConfig
 
 Result = TypeVar("Result")
@@ -64,6 +65,12 @@ def read_json(path: Path) -> Any:
     """Returns a trial's file. Raises `ValueError` for a file that is not JSON."""
     with error_context(f"{path} holds no trials; remove it to start again"):
         return json.loads(path.read_text())
+
+
+@cache
+def network_once(name: str) -> PlacementNetwork | None:
+    """Returns a model's placement network; each process reads it once."""
+    return load_placement_network(name)
 
 
 @lru_cache

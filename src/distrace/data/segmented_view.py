@@ -10,6 +10,7 @@ from torch import Tensor
 from distrace.data.observation import View
 from distrace.data.points import LEAST_POINTS, object_points, radius_of, thinned
 from distrace.data.up import GIVEN_TILT, Floor, Up, find_floor
+from distrace.pixels import rectangle_around
 
 CROP = 0.5  # of the object's size in the image, around it, where rays tell what is free
 BACKGROUND = 0.2  # radii behind the farthest point of the object: there nothing of it is
@@ -54,7 +55,7 @@ def find_object(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, 
     """
     inside = scene.seen if mask is None else scene.seen & mask
     check_count(int(inside.sum()))
-    around = _rectangle_around(inside)
+    around = rectangle_around(inside, _margins)
     floor = None if up.direction is None else find_floor(thinned(scene.masked(around).points()), up)
     if floor is not None:
         up = Up(floor.normal, floor.normal[None], GIVEN_TILT)
@@ -99,7 +100,7 @@ def find_object_again(first: SegmentedView, scene: View) -> SegmentedView | None
     if near.sum() < LEAST_POINTS:
         return None
     inside = _only(scene.seen, near)
-    return SegmentedView(scene, inside, _rectangle_around(inside), None, first.floor, first.up)
+    return SegmentedView(scene, inside, rectangle_around(inside, _margins), None, first.floor, first.up)
 
 
 def check_count(count: int) -> None:
@@ -108,16 +109,10 @@ def check_count(count: int) -> None:
         raise ValueError(f"{count} points of the object are known; at least {LEAST_POINTS} are needed")
 
 
-def _rectangle_around(inside: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """The pixels of a box about those that are inside."""
-    found = torch.zeros_like(inside)
-    spans = []
-    for axis in (1, 0):
-        occupied = inside.any(axis).nonzero()[:, 0]
-        margin = int(CROP * (occupied[-1] - occupied[0] + 1)) + 1
-        spans.append(slice(max(int(occupied[0]) - margin, 0), int(occupied[-1]) + margin + 1))
-    found[spans[0], spans[1]] = True
-    return found
+def _margins(length: int) -> tuple[int, int]:
+    """Returns how far around an object of a length rays tell what is free, in pixels."""
+    margin = int(CROP * length) + 1
+    return margin, margin
 
 
 def _only(pixels: Bool[Tensor, "height width"], chosen: Bool[Tensor, "n"]) -> Bool[Tensor, "height width"]:

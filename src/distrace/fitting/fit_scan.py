@@ -106,28 +106,18 @@ def fit_scan(
     ends = run_rounds(
         starts.states, config.rounds, partial(problem_of, placement_priors=starts.placement_priors), SOLVER, progress
     )
-    prior_deviation = None
-    if network is not None and place is None and len(scan.ups):
-        best = ends.states[0]
-        prior_deviation = starts.placement_priors[best.start].prior_deviation(best.place)
-    return _fitted(decoder, scan, prior, ends, starts.evaluations, prior_deviation, began)
+    return _fitted(decoder, scan, prior, starts, ends, began)
 
 
-def _fitted(
-    decoder: Decoder,
-    scan: Scan,
-    prior: Prior,
-    ends: Ends,
-    evaluations: int,
-    prior_deviation: float | None,
-    began: float,
-) -> ScanFit:
+def _fitted(decoder: Decoder, scan: Scan, prior: Prior, starts: Starts, ends: Ends, began: float) -> ScanFit:
     least, best = ends.losses[0], ends.states[0]
     codes = [state.code(prior) for state in ends.states]
     sdf = decoder.field(codes[0])
     equal = [k for k, loss in enumerate(ends.losses) if k and loss <= (1 + EQUAL) * least]
     others = tuple((codes[k], ends.states[k].place) for k in equal)
     placed = [(decoder.field(code), place) for code, place in others]
-    verdict = judged(scan, sdf, best.place, placed, prior_deviation=prior_deviation)
+    deviation = starts.placement_priors[best.start].prior_deviation(best.place)
+    verdict = judged(scan, sdf, best.place, placed, prior_deviation=deviation)
+    evaluations = starts.evaluations + ends.evaluations
     seconds = time.perf_counter() - began
-    return ScanFit(codes[0], best.place, least, verdict, ends.curves, evaluations + ends.evaluations, seconds, others)
+    return ScanFit(codes[0], best.place, least, verdict, ends.curves, evaluations, seconds, others)

@@ -37,9 +37,7 @@ class Verdict:
     seen: float  # share of the shape's length that the points span, along the axis where it is least
     disagreement: float  # how far the other good ends lie from the surface, in sizes; 0 where there are none
     silhouette: float | None  # intersection over union with the mask, where that is the object's alone
-    prior_deviation: (
-        float | None
-    )  # deviations of size or centre from what was likely; None where the placement is known
+    prior_deviation: float | None  # of size or centre from the placement prior, in its deviations; None without one
     reason: str
 
     def facts(self) -> dict[str, float | str | None]:
@@ -50,9 +48,7 @@ class Verdict:
             "extent_seen": round(self.seen, 4),
             "disagreement": round(self.disagreement, 4),
             "silhouette_iou": self.silhouette if self.silhouette is None else round(self.silhouette, 4),
-            "placement_deviation": self.prior_deviation
-            if self.prior_deviation is None
-            else round(self.prior_deviation, 2),
+            "placement_deviation": None if self.prior_deviation is None else round(self.prior_deviation, 2),
             "reason": self.reason,
         }
 

@@ -20,8 +20,9 @@ from distrace.checkpoints.model import model_folder
 from distrace.data.scan import Scan
 from distrace.errors import error_context
 from distrace.files import atomic_write
+from distrace.fitting.ray_sampling import drawn
 from distrace.pose import Similarity
-from distrace.rays import Rays
+from distrace.rays import Rays, meet_sphere
 from distrace.vectors import perpendicular
 
 PLACEMENT_FILE = "placement.safetensors"  # in a model's folder
@@ -29,6 +30,7 @@ TURN_BINS = 72  # of which each has its probability
 CELLS = 40  # along each side of the grid
 SLICES = 8  # of height
 REACH = 1.6  # from the middle to the border of the grid, in radii of the scan
+FREE_REACH = 1.5**0.5 * REACH  # radii of the scan, of the sphere in which free space is looked at
 RAY_SAMPLES = 4  # points of free space on each ray
 FREE_MARGIN = 0.03  # radii before a ray's end, from where space may not be free
 POINTS = 768  # of the surface in a grid, at most, and as many rays
@@ -72,18 +74,16 @@ def grids_of(
     `rays` [b, m] are free up to a distance; those with `until` 0 say nothing.
     """
     surface = _counts(frame.points(points), known)
-    origins = frame.points(rays.origins)
-    directions = frame.directions(rays.directions)
-    middle = -(origins * directions).sum(-1)
-    nearest = (origins + middle[..., None] * directions).square().sum(-1)
-    half = (1.5 * REACH**2 - nearest).clamp_min(0).sqrt()
-    near = (middle - half).clamp_min(0)
-    far = torch.minimum(middle + half, until / frame.radius[:, None] - FREE_MARGIN)
+    rays = Rays(frame.points(rays.origins), frame.directions(rays.directions))
+    bounds = meet_sphere(rays, FREE_REACH)
+    near = bounds.near
+    far = bounds.far.minimum(until / frame.radius[:, None] - FREE_MARGIN)
     shares = (torch.arange(RAY_SAMPLES) + torch.rand(*near.shape, RAY_SAMPLES, generator=random)) / RAY_SAMPLES
+    passes = near < far
+    near, far = near.where(passes, 0.0), far.where(passes, 0.0)
     t = near[..., None] + (far - near)[..., None] * shares.to(near)
-    samples = origins[:, :, None] + t.nan_to_num(0.0)[..., None] * directions[:, :, None]
-    passes = (near < far)[..., None].expand(t.shape)
-    free = _counts(samples.flatten(1, 2), passes.flatten(1, 2))
+    samples = rays.origins[:, :, None] + t[..., None] * rays.directions[:, :, None]
+    free = _counts(samples.flatten(1, 2), passes[..., None].expand(t.shape).flatten(1, 2))
     return torch.cat([surface, free], dim=1).log1p()
 
 
@@ -195,14 +195,10 @@ def guess_placement(network: PlacementNetwork, scan: Scan, up: Float[Tensor, "3"
 
 
 def _drawn_grids(scan: Scan, frame: GridFrame, random: torch.Generator) -> Float[Tensor, "b channels cells cells"]:
-    points = torch.stack([_rows(len(scan.points), random) for _ in range(RESAMPLINGS)])
-    rays = torch.stack([_rows(len(scan.free_until), random) for _ in range(RESAMPLINGS)])
+    points = torch.stack([drawn(torch.arange(len(scan.points)), POINTS, random) for _ in range(RESAMPLINGS)])
+    rays = torch.stack([drawn(torch.arange(len(scan.free_until)), POINTS, random) for _ in range(RESAMPLINGS)])
     known = torch.ones_like(points, dtype=torch.bool)
     return grids_of(frame, scan.points[points], known, scan.free[rays], scan.free_until[rays], random)
-
-
-def _rows(count: int, random: torch.Generator) -> Tensor:
-    return torch.randperm(count, generator=random)[:POINTS]
 
 
 def _ahead(scan: Scan, up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:

@@ -1,5 +1,6 @@
 """How far a placed shape is from a scan: residuals of its code and its placement, and their exact Jacobian."""
 
+import math
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -55,10 +56,12 @@ class PlacementPrior:
     centre: Float[Tensor, "3"]
     up: Float[Tensor, "3"] | None
     size_deviation: float = GROWTH  # of the logarithm
-    centre_deviation: float = torch.inf  # in sizes, along each axis
+    centre_deviation: float = torch.inf  # in sizes, along each axis; `inf` where no network was asked
 
-    def prior_deviation(self, place: Similarity) -> float:
-        """Returns how many deviations a placement is away, by its size or by its centre."""
+    def prior_deviation(self, place: Similarity) -> float | None:
+        """Returns how many deviations a placement is away, by size or centre; None where no network was asked."""
+        if math.isinf(self.centre_deviation):
+            return None
         size = abs(float((place.scale / self.size).log())) / self.size_deviation
         shift = (place.translation - self.centre).square().mean().sqrt() / self.size
         return max(size, float(shift) / self.centre_deviation)

@@ -113,14 +113,13 @@ def _of_network(scan: Scan, prior: Prior, network: PlacementNetwork, seed: int) 
     states = []
     placement_priors = []
     on_cpu = scan.to("cpu")
+    knows_up = len(scan.ups) > 0  # the network has seen upright objects alone
     for up in _candidate_ups(on_cpu):
         guess = guess_placement(network, on_cpu, up, seed)
         for place in guess.places(LIKELY):
             place = place.to(prior.mean.device)
             states.append(PlacedCode.at(place, prior.mean, len(states)))
-            placement_priors.append(
-                placement_prior(place, scan, guess if len(scan.ups) else None)
-            )  # it knows upright objects
+            placement_priors.append(placement_prior(place, scan, guess if knows_up else None))
     return Starts(states, placement_priors)
 
 

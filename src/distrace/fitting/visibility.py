@@ -8,6 +8,7 @@ from torch import Tensor
 
 from distrace.data.observation import View
 from distrace.fitting.ray_sampling import band, drawn, middles
+from distrace.pixels import rectangle_around
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ def rays_of(view: View, count: int, seed: int = 0) -> ObservedRays:
     inside = view.observed
     if not inside.any():
         raise ValueError("the view shows nothing of the object; it needs a depth, a mask or normals")
-    regions = [inside] if view.mask is None else [inside, band(view.mask), _around(view.mask)]
+    regions = [inside] if view.mask is None else [inside, band(view.mask), rectangle_around(view.mask, _half)]
     pixels = [region.reshape(-1).nonzero()[:, 0] for region in regions]
     chosen = torch.cat([drawn(some, count // len(regions), random) for some in pixels])
     is_object = inside.reshape(-1)[chosen]
@@ -75,13 +76,6 @@ def _outside(inside: Bool[Tensor, "height width"]) -> Float[Tensor, "height widt
     return torch.stack([columns - x, rows - y], dim=-1).float()
 
 
-def _around(mask: Bool[Tensor, "height width"]) -> Bool[Tensor, "height width"]:
-    """A box around the object, half as large again to each side."""
-    box = torch.zeros_like(mask)
-    spans = []
-    for axis in (1, 0):
-        there = mask.any(axis).nonzero()[:, 0]
-        half = int(there[-1] - there[0] + 1) // 2
-        spans.append(slice(max(int(there[0]) - half, 0), int(there[-1]) + 1 + half))
-    box[spans[0], spans[1]] = True
-    return box
+def _half(length: int) -> tuple[int, int]:
+    """Returns the margins of a rectangle that is half as large again to each side."""
+    return length // 2, length // 2
