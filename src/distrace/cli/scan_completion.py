@@ -4,10 +4,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from distrace import shading
-from distrace.antialiasing import smooth_outline
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
@@ -23,14 +21,13 @@ from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
 from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
-from distrace.render import render
+from distrace.report.mesh_picture import mesh_picture
 from distrace.report.scan_page import scan_page
 
 if TYPE_CHECKING:
     import trimesh
 
-PICTURE = 128  # pixels along the longer side, of what the sensor sees
-SIDE = 96  # pixels, of the other views
+SIDE = 256  # pixels along the longer side of pictures
 VIEWS = {
     "front": (0, 15),
     "back": (180, 15),
@@ -57,9 +54,10 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     place = fit.place.to("cpu")
     save_code(run.out, fit.code, place)
     save_scan(run.out / "scan.npz", task.scan)
-    mesh = mesh_in_world(extract_mesh(task.model.field(fit.code), task.mesh), place)
+    shape = extract_mesh(task.model.field(fit.code), task.mesh)
+    mesh = mesh_in_world(shape, place)
     save_meshes(run.out, mesh, task.formats)
-    pictures = _pictures(task, fit, place)
+    pictures = _pictures(task.scan, shape, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
     facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}
     lines = [f"{fit.verdict.name}: {fit.verdict.reason}"]
@@ -98,18 +96,15 @@ def _fitted(task: ScanTask) -> ScanFit:
         )
 
 
-@torch.no_grad()
-def _pictures(task: ScanTask, fit: ScanFit, place: Similarity) -> dict[str, shading.Picture]:
-    """Returns the completion from the sensor, and from all sides."""
-    sdf = task.model.field(fit.code)
+def _pictures(scan: Scan, mesh: "trimesh.Trimesh", place: Similarity) -> dict[str, shading.Picture]:
+    """Returns the completion in the object's frame, as the sensor sees it and from all sides."""
     cameras: dict[str, Camera] = {}
-    for number, view in enumerate(task.scan.views):
-        name = "the sensor" if len(task.scan.views) == 1 else f"sensor {number + 1}"
-        cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, PICTURE / max(view.depth.shape))))
+    for number, view in enumerate(scan.views):
+        name = "the sensor" if len(scan.views) == 1 else f"sensor {number + 1}"
+        cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, SIDE / max(view.depth.shape))).to("cpu"))
     for name, (azimuth, elevation) in VIEWS.items():
         cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
-    on_device = {name: camera.to(task.mesh.device) for name, camera in cameras.items()}
-    return {name: smooth_outline(render(sdf, camera), camera) for name, camera in on_device.items()}
+    return {name: mesh_picture(mesh, camera) for name, camera in cameras.items()}
 
 
 def _in_object(shape: "trimesh.Trimesh | np.ndarray", place: Similarity) -> "trimesh.Trimesh | np.ndarray":
