@@ -113,3 +113,13 @@ def test_every_library_belongs_to_an_extra_of_the_package() -> None:
         requirements = project["optional-dependencies"][extra]
         assert any(each.startswith(packages.get(library, library)) for each in requirements), library
     assert set(EXTRAS.values()) == {*project["optional-dependencies"]} - {"all", "dev", "clips", "docs"}
+
+
+def test_a_library_without_a_wheel_for_this_machine_is_to_be_built(
+    without: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    without("embreex")
+    monkeypatch.setattr("sys.platform", "linux")
+    monkeypatch.setattr("platform.machine", lambda: "aarch64")
+    with pytest.raises(MissingLibrary, match=r"^casting needs embreex; it has no wheel for Linux on aarch64"):
+        require("casting", "embreex")

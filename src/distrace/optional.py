@@ -1,5 +1,7 @@
 """Libraries that only a part of distrace needs. Extras of the package install them."""
 
+import platform
+import sys
 from importlib import import_module
 
 EXTRAS = {
@@ -12,6 +14,7 @@ EXTRAS = {
     "OpenEXR": "scans",
     "viser": "view",
 }
+ONLY_X86_64 = ("embreex", "pycolmap")  # have no wheels for Linux on other processors
 
 
 class MissingLibrary(ModuleNotFoundError):
@@ -29,5 +32,8 @@ def require(purpose: str, *libraries: str) -> None:
         except ModuleNotFoundError as error:
             if error.name != library:
                 raise
-            extra = f"pip install 'distrace[{EXTRAS[library]}]'"
-            raise MissingLibrary(f"{purpose} needs {library}; install it by {extra}", name=library) from error
+            if library in ONLY_X86_64 and sys.platform == "linux" and platform.machine() != "x86_64":
+                advice = f"it has no wheel for Linux on {platform.machine()}: build it from its sources"
+            else:
+                advice = f"install it by pip install 'distrace[{EXTRAS[library]}]'"
+            raise MissingLibrary(f"{purpose} needs {library}; {advice}", name=library) from error
