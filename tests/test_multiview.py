@@ -15,7 +15,7 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, save_model
 from distrace.cli import main
-from distrace.data.photographs import Photograph, Photographs, Placement, save_photographs
+from distrace.data.photographs import Photograph, Photographs, UnitSphere, save_photographs
 from distrace.photos.fit_photos import KNOWN_PLACE
 from distrace.render import render
 
@@ -35,7 +35,7 @@ def save_views(folder: Path, cameras: list[Camera]) -> None:
     views = [
         Photograph(f"{k:02}", camera, image) for k, (camera, image) in enumerate(zip(cameras, images, strict=True))
     ]
-    save_photographs(folder, Photographs(tuple(views), Placement(torch.tensor([3.0, 0, 0]).double(), 2.0), "ours"))
+    save_photographs(folder, Photographs(tuple(views), UnitSphere(torch.tensor([3.0, 0, 0]).double(), 2.0), "ours"))
 
 
 def test_a_folder_of_photographs_becomes_a_mesh_in_its_own_world(

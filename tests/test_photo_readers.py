@@ -96,7 +96,7 @@ def test_transforms_with_one_angle_are_read_and_alpha_is_the_mask(tmp_path: Path
     loaded = load_photographs(angles(tmp_path))
     assert loaded.layout == "transforms_train.json"
     for k, view in enumerate(loaded.views):
-        camera = loaded.placement.camera_to_world(view.camera)
+        camera = loaded.unit_sphere.camera_to_world(view.camera)
         torch.testing.assert_close(camera.rays().directions, angled(k).rays().directions.float(), atol=1e-5, rtol=0)
         torch.testing.assert_close(camera.rays().origins, angled(k).rays().origins.float(), atol=1e-4, rtol=0)
         assert view.mask is not None
@@ -190,9 +190,9 @@ def model(
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
 def test_models_of_colmap_are_read_and_their_points_tell_the_sphere(tmp_path: Path, kind: str, place: str) -> None:
     reads_back(model(tmp_path, kind, place), "COLMAP")
-    placement = load_photographs(tmp_path).placement
-    assert (placement.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
-    assert 0.5 < placement.radius / WORLD.radius < 1.2
+    unit_sphere = load_photographs(tmp_path).unit_sphere
+    assert (unit_sphere.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
+    assert 0.5 < unit_sphere.radius / WORLD.radius < 1.2
 
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
@@ -219,8 +219,8 @@ def test_lines_of_images_without_the_empty_ones_are_read(tmp_path: Path) -> None
 
 
 def test_models_of_few_points_are_placed_by_their_views(tmp_path: Path) -> None:
-    placement = load_photographs(model(tmp_path, "text", points=3)).placement
-    assert (placement.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
+    unit_sphere = load_photographs(model(tmp_path, "text", points=3)).unit_sphere
+    assert (unit_sphere.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
 
 
 def test_older_models_without_rigs_are_read(tmp_path: Path) -> None:
@@ -283,9 +283,9 @@ def projections(folder: Path, **changed: object) -> Path:
 
 def test_projections_of_idr_are_read(tmp_path: Path) -> None:
     reads_back(projections(tmp_path), "IDR")
-    placement = load_photographs(tmp_path).placement
-    assert torch.equal(placement.centre, WORLD.centre)
-    assert placement.radius == WORLD.radius
+    unit_sphere = load_photographs(tmp_path).unit_sphere
+    assert torch.equal(unit_sphere.centre, WORLD.centre)
+    assert unit_sphere.radius == WORLD.radius
 
 
 def test_a_unit_sphere_smaller_than_the_object_is_noted(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from distrace.cli import main
 from distrace.cli.reconstruct import parted, without
 from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
-from distrace.data.photographs import Photographs, Placement, save_photographs
+from distrace.data.photographs import Photographs, UnitSphere, save_photographs
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fields.primitives import box, sphere, torus
 from distrace.photos.visual_hull import mask_overlaps, visual_hull
@@ -375,16 +375,16 @@ def test_a_dark_background_gives_masks(views: list[Photograph]) -> None:
         replace(view, image=(view.image + 0.02 * torch.rand(view.image.shape, generator=random)).clamp(0, 1), mask=None)
         for view in views
     ]
-    found = masked(Photographs(tuple(noisy), Placement(torch.zeros(3).double(), 2.0), "ours"))
+    found = masked(Photographs(tuple(noisy), UnitSphere(torch.zeros(3).double(), 2.0), "ours"))
     for view, truth in zip(found.views, views, strict=True):
         assert view.mask is not None
         assert truth.mask is not None
         assert (view.mask & truth.mask).sum() / (view.mask | truth.mask).sum() > 0.9
-        there = found.placement.camera_to_world(view.camera).T_world_camera
+        there = found.unit_sphere.camera_to_world(view.camera).T_world_camera
         assert torch.allclose(there[:3, 3], 2 * truth.camera.T_world_camera[:3, 3], atol=1e-5)
     bright = [replace(view, image=1 - view.image) for view in noisy]
     with pytest.raises(ValueError, match="00 and 7 others have no mask, and their background is not dark"):
-        masked(Photographs(tuple(bright), found.placement, "ours"))
+        masked(Photographs(tuple(bright), found.unit_sphere, "ours"))
 
 
 def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
@@ -408,8 +408,8 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 2)
     monkeypatch.setattr("distrace.cli.reconstructed.FITTED_SHOWN", 1)
     monkeypatch.setattr("distrace.reconstruction.cameras.STEPS", 5)
-    placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
-    save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
+    unit_sphere = UnitSphere(torch.tensor([3.0, 0, 0]).double(), 2.0)
+    save_photographs(tmp_path / "views", Photographs(tuple(views), unit_sphere, "ours"))
     out = tmp_path / "out"
     few = ["--steps", 30, "--retouching", 5, "--sizes", 16, 32, "--rays", 128, "--width", 16]
     run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4, "--format", "ply", "obj")
@@ -433,7 +433,7 @@ def test_photographs_without_masks_end_in_one_sentence(
     views: list[Photograph], tmp_path: Path, run: Command, capsys: pytest.CaptureFixture
 ) -> None:
     bright = tuple(replace(view, image=1 - view.image, mask=None) for view in views)
-    save_photographs(tmp_path / "views", Photographs(bright, Placement(torch.zeros(3).double(), 1.0), "ours"))
+    save_photographs(tmp_path / "views", Photographs(bright, UnitSphere(torch.zeros(3).double(), 1.0), "ours"))
     with pytest.raises(SystemExit) as stop:
         run(tmp_path / "views", "--out", tmp_path / "o")
     assert stop.value.code == 2

@@ -86,7 +86,7 @@ class Multiview:
                 "terms": last.terms,
                 "start": last.start,
                 "T_unit_object": last.place.T_world_object.tolist(),
-                "unit_sphere": found.placement.described(),
+                "unit_sphere": found.unit_sphere.described(),
                 "doubtful": [view.name for view in agreed if view.is_outlier],
                 "evaluations": fit.evaluations,
                 "setup_evaluations": fit.setup_evaluations,
@@ -106,12 +106,12 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> P
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> "trimesh.Trimesh":
     """Returns the mesh in the folder's world."""
     mesh_unit = mesh_in_world(extract_mesh(model.field(step.code), config), step.place)
-    return mesh_in_world(mesh_unit, found.placement.similarity)
+    return mesh_in_world(mesh_unit, found.unit_sphere.similarity)
 
 
 def _described(found: Photographs) -> str:
-    centre = ", ".join(f"{x:.4g}" for x in found.placement.centre.tolist())
-    return f"the unit sphere lies around ({centre}) with a radius of {found.placement.radius:.4g}"
+    centre = ", ".join(f"{x:.4g}" for x in found.unit_sphere.centre.tolist())
+    return f"the unit sphere lies around ({centre}) with a radius of {found.unit_sphere.radius:.4g}"
 
 
 def _doubt(view: ViewAgreement) -> str:

@@ -74,7 +74,7 @@ class Reconstruct:
         fitted_to, held_out = parted(found.views, self.held_out)
         with run_lock(run.out):
             state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
-            found_shape = Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out)
+            found_shape = Reconstructed(self.views.name, state, self.config, found.unit_sphere, fitted_to, held_out)
             found_shape.save(run, resolved, self.format)
 
     @property

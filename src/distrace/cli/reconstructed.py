@@ -15,7 +15,7 @@ from distrace.cli.common import Format, save_meshes
 from distrace.cli.console import Run, device_name
 from distrace.data.photo_readers.transforms import save_cameras
 from distrace.data.photograph import Photograph
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.files import save_text
 from distrace.mesh import MeshConfig, mesh_in_world
 from distrace.movie import save_gif
@@ -38,7 +38,7 @@ class Reconstructed:
     name: str
     state: Reconstruction
     config: ReconstructConfig
-    placement: Placement
+    unit_sphere: UnitSphere
     fitted_to: Sequence[Photograph]
     held_out: Sequence[Photograph]
 
@@ -51,7 +51,7 @@ class Reconstructed:
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
-        save_meshes(run.out, mesh_in_world(mesh, self.placement.similarity), formats)
+        save_meshes(run.out, mesh_in_world(mesh, self.unit_sphere.similarity), formats)
         rows = self._rows(held_out)
         files = [view.source.file for view in self.fitted_to if view.source is not None]
         save_cameras(run.out / "transforms.json", dict(zip(files, self._refined_in_world, strict=True)))
@@ -61,7 +61,7 @@ class Reconstructed:
                 "held_out": {
                     view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out
                 },
-                "unit_sphere": self.placement.described(),
+                "unit_sphere": self.unit_sphere.described(),
                 "cameras": self._cameras(),
                 "steps": self.state.step,
                 "evaluations": self.state.evaluations,
@@ -78,11 +78,11 @@ class Reconstructed:
     def _refined_in_world(self) -> list[Camera]:
         """Returns the refined cameras in the folder's world, from the cameras of the folder in double."""
         exact = [
-            replace(view, camera=self.placement.camera_to_unit(view.source.camera))
+            replace(view, camera=self.unit_sphere.camera_to_unit(view.source.camera))
             for view in self.fitted_to
             if view.source is not None
         ]
-        return [self.placement.camera_to_world(view.camera) for view in self._moved(exact)]
+        return [self.unit_sphere.camera_to_world(view.camera) for view in self._moved(exact)]
 
     def _moved(self, views: Sequence[Photograph]) -> list[Photograph]:
         """Returns the views that were fitted to, each with its camera's motion."""

@@ -12,7 +12,7 @@ import torch
 from distrace.camera import Camera
 from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, listed, matrix, read_json
 from distrace.data.pictures import picture_size
-from distrace.data.placement import MAX_COORDINATE
+from distrace.data.unit_sphere import MAX_COORDINATE
 from distrace.errors import about
 from distrace.files import save_json
 
