@@ -599,6 +599,8 @@ BAD = [
     ("complete {model} {tmp}/a.png {tmp}/b.png --poses {tmp}/text --intrinsics 9,9,4,4", "--poses names 1 files"),
     ("complete {model} {tmp}/a.png {tmp}/b.ply --intrinsics 9,9,4,4", "b.ply (a cloud) were given together"),
     ("complete {model} {tmp}/a.npz {tmp}/b.ply", "observations of one world, or clouds in one frame"),
+    ("complete {model}", "no input was given; give a depth image"),
+    ("complete {model} --frame canonical", "0 inputs were given; give one"),
     ("complete {model} {view} {view}", "2 inputs were given; give one, or --frame input"),
     ("complete {model} {view} --seed -1", "--seed -1 was given; a number from 0"),
     ("complete {model} {silhouette} --ignore mask", "silhouette.npz: without its mask it shows nothing"),

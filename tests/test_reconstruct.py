@@ -21,12 +21,15 @@ from torch.nn import functional as F
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.cli import main
+from distrace.cli.console import start
 from distrace.cli.reconstruct import parted, without
+from distrace.cli.reconstructed import Reconstructed
 from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
-from distrace.data.photographs import Photographs, UnitSphere, save_photographs
+from distrace.data.photographs import Photographs, UnitSphere, load_photographs, save_photographs
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fields.primitives import box, sphere, torus
+from distrace.mesh import MeshConfig
 from distrace.photos.visual_hull import mask_overlaps, visual_hull
 from distrace.pose import exp_se3
 from distrace.rays import Rays, meet_sphere
@@ -427,6 +430,27 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
         mesh = trimesh.load(out / name)
         assert np.asarray(mesh.bounds).mean(0) == pytest.approx([3.0, 0, 0], abs=0.8)
         assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1
+
+
+def test_views_that_were_read_from_no_file_are_saved_without_transforms(
+    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("distrace.cli.reconstructed.FITTED_SHOWN", 1)
+    unit_sphere = UnitSphere(torch.tensor([3.0, 0, 0]).double(), 2.0)
+    few = views[:2]
+    save_photographs(tmp_path / "views", Photographs(tuple(few), unit_sphere, "ours"))
+    read = load_photographs(tmp_path / "views").views[0]
+    config = replace(SHORT, sizes=(16,))
+    state = Reconstruction.fresh(SMALL, config, len(few), CPU)
+    found = Reconstructed("balls", state, config, unit_sphere, [read, few[1]], [])
+    found.save(start(tmp_path / "out"), MeshConfig(16), ["ply"])
+    cameras = json.loads((tmp_path / "out" / "result.json").read_text())["cameras"]
+    assert list(cameras) == [view.name for view in few]
+    for view in few:
+        expected = unit_sphere.camera_to_world(view.camera).T_world_camera
+        torch.testing.assert_close(torch.tensor(cameras[view.name]["T_world_camera"]), expected)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/00.png"]
 
 
 def test_photographs_without_masks_end_in_one_sentence(

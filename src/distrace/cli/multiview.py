@@ -11,7 +11,7 @@ from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, Format, ModelName, Views, check_formats, opened_for, save_meshes
 from distrace.cli.console import console, progress, start
-from distrace.data.photo_readers.transforms import save_cameras
+from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text
 from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
@@ -78,8 +78,7 @@ class Multiview:
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
-        sources = [view.source for view in found.views if view.source is not None]
-        save_cameras(run.out / "transforms.json", {source.file: source.camera for source in sources})
+        save_transforms(run.out, {view.name: view.source for view in found.views if view.source is not None})
         run.finish(
             {
                 "loss": last.loss,

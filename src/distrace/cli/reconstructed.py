@@ -13,7 +13,7 @@ import torch
 from distrace.camera import Camera
 from distrace.cli.common import Format, save_meshes
 from distrace.cli.console import Run, device_name
-from distrace.data.photo_readers.transforms import save_cameras
+from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photograph import Photograph
 from distrace.data.unit_sphere import UnitSphere
 from distrace.files import save_text
@@ -53,8 +53,12 @@ class Reconstructed:
         _save_film(run.out)
         save_meshes(run.out, mesh_in_world(mesh, self.unit_sphere.similarity), formats)
         rows = self._rows(held_out)
-        files = [view.source.file for view in self.fitted_to if view.source is not None]
-        save_cameras(run.out / "transforms.json", dict(zip(files, self._refined_in_world, strict=True)))
+        refined = {
+            view.name: replace(view.source, camera=camera)
+            for view, camera in zip(self.fitted_to, self._refined_in_world, strict=True)
+            if view.source is not None
+        }
+        save_transforms(run.out, refined)
         run.finish(
             {
                 "rows": rows,
@@ -76,11 +80,10 @@ class Reconstructed:
 
     @cached_property
     def _refined_in_world(self) -> list[Camera]:
-        """Returns the refined cameras in the folder's world, from the cameras of the folder in double."""
+        """Returns the refined cameras in the folder's world, in double where the views were read from files."""
         exact = [
-            replace(view, camera=self.unit_sphere.camera_to_unit(view.source.camera))
+            view if view.source is None else replace(view, camera=self.unit_sphere.camera_to_unit(view.source.camera))
             for view in self.fitted_to
-            if view.source is not None
         ]
         return [self.unit_sphere.camera_to_world(view.camera) for view in self._moved(exact)]
 

@@ -135,7 +135,7 @@ def _photograph(frame: Frame) -> Photograph:
         matrices = torch.from_numpy(frame.intrinsics), torch.from_numpy(frame.T_world_camera)
         camera = Camera.from_matrices(*matrices, height, width)
         check_intrinsics(camera)
-    return Photograph(frame.image.stem, camera, image, mask, Source(frame.image, camera))
+    return Photograph(frame.image.stem, camera, image, mask, Source(frame.image, camera, frame.mask))
 
 
 def _remarks(view: Photograph) -> list[str]:
