@@ -30,7 +30,7 @@ from distrace.pose import turned_object, zoomed
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.training.config import TrainConfig
-from distrace.training.trainer import start, train
+from distrace.training.trainer import start_training, train
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}
@@ -42,7 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two spheres, learnt in a second."""
     folder = tmp_path_factory.mktemp("models") / "spheres"
     samples, config = spheres(*RADII), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
-    training = start(2, SPECS, config, torch.device("cpu"))
+    training = start_training(2, SPECS, config, torch.device("cpu"))
     for _ in train(samples, training, config):
         pass
     save_experiment(folder, training.decoder, training.codes, tuple(samples.names))

@@ -54,7 +54,7 @@ from distrace.reconstruction.state import (
     save_reconstruction,
 )
 from distrace.render import render
-from distrace.report.reconstruction_page import judged
+from distrace.report.reconstruction_page import compared_view
 from distrace.surface import attach
 from distrace.tracing.sphere_tracing import sphere_trace
 
@@ -136,8 +136,8 @@ def test_squareplus_is_smooth_and_close_to_relu() -> None:
 
 
 def test_a_fit_renders_a_held_out_view(views: list[Photograph], fitted: Reconstruction) -> None:
-    before = judged(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
-    after = judged(fitted, views[0], 40)
+    before = compared_view(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
+    after = compared_view(fitted, views[0], 40)
     assert after.silhouette_iou > max(0.9, before.silhouette_iou)
     assert after.psnr > before.psnr + 3
     assert fitted.evaluations > SHORT.steps * SHORT.rays
@@ -169,10 +169,10 @@ def test_colour_refinement_changes_colours_alone(views: list[Photograph], fitted
     config = replace(SHORT, refinement_steps=60)
     state = deepcopy(fitted)
     training = views[1:]
-    before = judged(state, training[0], 40)
+    before = compared_view(state, training[0], 40)
     list(reconstruct(training, state, config))
     assert state.step == config.total == fitted.step + 30
-    after = judged(state, training[0], 40)
+    after = compared_view(state, training[0], 40)
     assert after.psnr > before.psnr
     assert after.silhouette_iou == before.silhouette_iou
     for one, other in zip(state.surface.parameters(), fitted.surface.parameters(), strict=True):

@@ -7,7 +7,7 @@ from torch import Tensor
 from distrace import shading, surface
 from distrace.benchmarks.agreement import Measured
 from distrace.render import Buffers
-from distrace.report.completion_page import View as Rendered
+from distrace.report.completion_page import RenderedView
 from distrace.shading import Picture
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")
@@ -34,7 +34,7 @@ def pictures_of(measured: Measured) -> list[Picture]:
     normal = torch.zeros_like(rays.directions)
     with torch.no_grad():
         normal[visible] = surface.normals(measured.view.sdf, rays[visible].at(distance[visible]))
-        rendered = Rendered.of(buffers).shaded
+        rendered = RenderedView.of(buffers).shaded
     reference = shading.shaded_picture(normal, visible, rays.directions)
     crop = _crop(visible | buffers.mask)
     times = max(1, SIDE // max(visible[crop].shape))

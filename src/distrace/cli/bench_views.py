@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 
 from distrace.benchmarks.agreement import Measured, Reference, badness, measure_view, reference_of, summaries
 from distrace.benchmarks.pictures import pictures_of
-from distrace.benchmarks.random_views import View, model_views
+from distrace.benchmarks.random_views import RandomView, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
 from distrace.cli.console import Run, origin, progress
@@ -34,12 +34,12 @@ class Plan:
         if not 1 <= low <= high:
             raise ValueError(f"--sizes {low} {high} was given; give the smallest size first, at least 1 pixel")
 
-    def draw(self, models: Sequence[Model]) -> Iterator[View]:
+    def draw(self, models: Sequence[Model]) -> Iterator[RandomView]:
         """Draws all views, one by one."""
         for model in models:
             yield from model_views(model, self.views, self.sizes, self.seed)
 
-    def reference(self, view: View) -> Reference:
+    def reference(self, view: RandomView) -> Reference:
         """Computes the reference of a view."""
         return reference_of(view)
 

@@ -124,7 +124,7 @@ def _page_content(task: Task, outcome: CompletionResult) -> report.Completion:
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, code)
         camera = task.camera.to(task.mesh.device)
-        before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
+        before, after = (report.RenderedView.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
     pruned = outcome.mesh.metadata.get(PRUNED_PIECES, 0)
     facts = {
@@ -172,13 +172,13 @@ def _other_pictures(task: Task, outcome: CompletionResult) -> list[list[shading.
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
         distance[buffers.mask] = posterior_deviation(model, codes, buffers.points)
-        pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
+        pictures = [report.RenderedView.of(render(model.field(code), eye), eye).shaded for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows
 
 
-def _truth_view(full: View) -> report.View | None:
+def _truth_view(full: View) -> report.RenderedView | None:
     """Returns the whole observation, or None where a part of it is missing."""
     if full.mask is None or full.normal is None or full.shaded is None:
         return None
-    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)
+    return report.RenderedView(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)

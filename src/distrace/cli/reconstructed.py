@@ -22,7 +22,7 @@ from distrace.movie import save_gif
 from distrace.pose import exp_se3
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
 from distrace.reconstruction.state import ReconstructConfig, Reconstruction
-from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.report.reconstruction_page import ComparedView, coloured_mesh, compared_view, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
 if TYPE_CHECKING:
@@ -96,11 +96,11 @@ class Reconstructed:
         """Returns by how many pixels each camera moved."""
         return [pixel_shift(*each) for each in zip(self.fitted_to, self._refined, strict=True)]
 
-    def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
+    def _judged(self, views: Sequence[Photograph]) -> list[ComparedView]:
         """Compares views with their renderings, in the size that was fitted last."""
-        return [judged(self.state, view, self.config.sizes[-1]) for view in views]
+        return [compared_view(self.state, view, self.config.sizes[-1]) for view in views]
 
-    def _rows(self, held_out: Sequence[Judged]) -> list[dict[str, object]]:
+    def _rows(self, held_out: Sequence[ComparedView]) -> list[dict[str, object]]:
         if not held_out:
             return []
         judgements = {
@@ -118,7 +118,7 @@ class Reconstructed:
         step = interpolated_step(steps, eyes, view.camera.T_world_camera[:3, 3])
         return moved(view, exp_se3(step[:3], step[3:]))
 
-    def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[Judged]) -> None:
+    def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[ComparedView]) -> None:
         examples = self._judged(self._refined[:: -(-len(self._refined) // FITTED_SHOWN)])
         facts = {
             "views": f"{len(self.fitted_to)}, and {len(held_out)} held out",

@@ -27,7 +27,7 @@ def radius_of(points: Float[Tensor, "n 3"]) -> float:
     return RADIUS_FACTOR * float(away.quantile(RADIUS_SHARE))
 
 
-def thinned(rows: Tensor, most: int = MOST_POINTS) -> Tensor:
+def random_subset(rows: Tensor, most: int = MOST_POINTS) -> Tensor:
     if len(rows) <= most:
         return rows
     return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:most]]

@@ -15,7 +15,7 @@ from distrace.photos.fit_photos import PhotoStep
 from distrace.photos.judge import ViewAgreement
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
-from distrace.report.completion_page import View
+from distrace.report.completion_page import RenderedView
 from distrace.report.page import figure, page, paragraph, row, section, table
 from distrace.report.scene import space_section
 from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
@@ -61,7 +61,7 @@ def forming(model: Model, steps: Sequence[PhotoStep], camera: Camera) -> UInt8[n
     """Returns renderings of the shape during the best start of the fit, the last step included."""
     best = [step for step in steps if step.start == steps[-1].start]
     frames = [*best[:: -(-len(best) // FRAMES)], best[-1]]
-    pictures = [View.of(_rendered(model, step, camera)).shaded for step in frames]
+    pictures = [RenderedView.of(_rendered(model, step, camera)).shaded for step in frames]
     return np.stack(pictures)
 
 
@@ -71,7 +71,7 @@ def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
     buffers = _rendered(model, step, view.camera)
     picture = colour_picture(small.image.cpu())
     picture[band(buffers.mask, 3).cpu().numpy()] = EXTRA
-    return side_by_side([picture, View.of(buffers).shaded])
+    return side_by_side([picture, RenderedView.of(buffers).shaded])
 
 
 @torch.no_grad()

@@ -48,7 +48,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def listed(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
+def object_list(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
     """A list of objects in a JSON file; raises `ValueError` for anything else."""
     entries = content.get(name)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

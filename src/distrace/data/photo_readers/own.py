@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from distrace.data.photo_readers.frames import Frame, Frames, file_of, listed, matrix, read_json
+from distrace.data.photo_readers.frames import Frame, Frames, file_of, matrix, object_list, read_json
 from distrace.data.unit_sphere import UnitSphere, unit_sphere_of
 from distrace.errors import about
 
@@ -16,7 +16,7 @@ def read(folder: Path) -> Frames | None:
     if not path.is_file():
         return None
     content = read_json(path)
-    entries = listed(content, "views", path)
+    entries = object_list(content, "views", path)
     frames = tuple(_frame(folder, entry, f"{path}: views[{k}]") for k, entry in enumerate(entries))
     return Frames("views.json", frames, _unit_sphere(content, path))
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from distrace.camera import Camera
-from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, listed, matrix, read_json
+from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, matrix, object_list, read_json
 from distrace.data.photograph import Source
 from distrace.data.pictures import picture_size
 from distrace.data.unit_sphere import MAX_COORDINATE
@@ -33,7 +33,7 @@ def read(folder: Path) -> Frames | None:
     if path is None:
         return None
     content = read_json(path)
-    entries = listed(content, "frames", path)
+    entries = object_list(content, "frames", path)
     frames = tuple(_frame(folder, content | entry, f"{path}: frames[{k}]") for k, entry in enumerate(entries))
     return Frames(path.name, frames)
 
@@ -138,7 +138,7 @@ def read_cameras(path: Path) -> list[Camera]:
     """Reads the cameras alone, in double, without their images. Raises `ValueError` as `read` does."""
     content = read_json(path)
     cameras = []
-    for number, entry in enumerate(listed(content, "frames", path)):
+    for number, entry in enumerate(object_list(content, "frames", path)):
         with about(f"{path}: frames[{number}]"):
             frame = content | entry
             size = (int(_number(frame, "h")), int(_number(frame, "w")))
