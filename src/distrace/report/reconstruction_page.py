@@ -93,16 +93,16 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def row_of(name: str, method: str, views: Mapping[str, Sequence[ComparedView]], seconds: float) -> dict[str, object]:
+def row_of(name: str, method: str, compared: Mapping[str, Sequence[ComparedView]], seconds: float) -> dict[str, object]:
     """Returns a row of the table of photographs: means over held-out views.
 
-    Each key of `views` names the cameras, and is appended to the columns' names.
+    Each key of `compared` names the cameras, and is appended to the columns' names.
     """
     numbers: dict[str, object] = {}
-    for cameras, views in views.items():
+    for cameras, views in compared.items():
         numbers[f"psnr{cameras}"] = round(mean(view.psnr for view in views), 2)
         numbers[f"silhouette_iou{cameras}"] = round(mean(view.silhouette_iou for view in views), 4)
-    count = len(next(iter(views.values())))
+    count = len(next(iter(compared.values())))
     return {"object": name, "method": method, **numbers, "views_held_out": count, "seconds": round(seconds)}
 
 
