@@ -62,7 +62,8 @@ class Reader(HTMLParser):
 
 def view(radius: float) -> RenderedView:
     with torch.no_grad():
-        return RenderedView.of(render(sphere(radius), Camera.orbit(30, 20, 4.0, height=48, width=48)))
+        camera = Camera.orbit(30, 20, 4.0, height=48, width=48)
+        return RenderedView.of(render(sphere(radius), camera), camera)
 
 
 @pytest.fixture(scope="module")

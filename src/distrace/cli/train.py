@@ -9,16 +9,15 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from distrace.benchmarks.measuring import poster_view
+from distrace.antialiasing import clay_picture
 from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import NONE, Every, default, opened
+from distrace.cli.common import NONE, Every, Orbit, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
 from distrace.render import render
 from distrace.report.charts import plot_history
-from distrace.report.completion_page import RenderedView
 from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
@@ -228,8 +227,8 @@ def _save(
     model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
     save_experiment(run.out, model.decoder, model.codes, model.shapes)
     training.decoder.eval()
-    camera = poster_view(128).to(run.device)
+    camera = Orbit(size=128).camera().to(run.device)
     numbers = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
     with torch.no_grad():
-        pictures = [RenderedView.of(render(model.field(number), camera)).shaded for number in numbers]
+        pictures = [clay_picture(render(model.field(number), camera)) for number in numbers]
     save_png(run.out / "preview.png", side_by_side(pictures))

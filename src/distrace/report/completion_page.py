@@ -48,14 +48,10 @@ class RenderedView:
     shaded: UInt8[np.ndarray, "height width 3"]
 
     @staticmethod
-    def of(buffers: Buffers, camera: Camera | None = None) -> "RenderedView":
-        """Returns the state as arrays; with its camera, the outline of the shaded picture is smooth."""
-        if camera is None:
-            shaded = shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
-        else:
-            shaded = smooth_outline(buffers, camera)
+    def of(buffers: Buffers, camera: Camera) -> "RenderedView":
+        """Returns the state as arrays."""
         depth, normal, mask = (image.detach().cpu().numpy() for image in (buffers.depth, buffers.normal, buffers.mask))
-        return RenderedView(depth, normal, mask, shaded)
+        return RenderedView(depth, normal, mask, smooth_outline(buffers, camera))
 
 
 @dataclass(frozen=True)
