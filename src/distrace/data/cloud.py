@@ -15,6 +15,7 @@ from distrace.data.checks import MAX_MEDIAN_RADIUS
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
+from distrace.data.points import random_subset
 from distrace.errors import DoubtfulResult, error_context
 
 
@@ -30,7 +31,7 @@ class Cloud:
 
     def sparse(self, count: int, seed: int = 0) -> "Cloud":
         """Returns at most `count` of the points, drawn at random."""
-        chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
+        chosen = random_subset(torch.arange(len(self.points)), count, seed)
         return Cloud(self.points[chosen], None if self.normals is None else self.normals[chosen])
 
     def without(self, *parts: str) -> "Cloud":

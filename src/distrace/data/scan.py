@@ -61,8 +61,7 @@ class Scan:
 
     def sparse(self, count: int, seed: int = 0) -> "Scan":
         """Returns the scan with at most `count` of its points, drawn at random."""
-        chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
-        return replace(self, points=self.points[chosen])
+        return replace(self, points=random_subset(self.points, count, seed))
 
 
 def joined(scans: Sequence[Scan]) -> Scan:
