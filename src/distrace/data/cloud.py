@@ -1,7 +1,7 @@
 """Points of a surface, as a scanner gives them: no camera, perhaps normals."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,9 +33,6 @@ class Cloud:
         """Returns at most `count` of the points, drawn at random."""
         chosen = random_subset(torch.arange(len(self.points)), count, seed)
         return Cloud(self.points[chosen], None if self.normals is None else self.normals[chosen])
-
-    def without(self, *parts: str) -> "Cloud":
-        return replace(self, normals=None) if "normal" in parts else self
 
     def seen_from(self, camera: Camera) -> View:
         """Returns the points as depths of the pixels that they fall into, the nearest of each; none hides another's."""
