@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 import distrace as dt
 from distrace.antialiasing import clay_picture
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, start
+from distrace.cli.console import start
 from distrace.fields.primitives import box, intersection
 from distrace.shading import Picture, save_png, side_by_side
 
@@ -39,7 +39,7 @@ class ForeignModels:
             save_png(run.out / "foreign-models.png", side_by_side(pictures))
         show_table(rows)
         evaluations = sum(int(row.get("evaluations", 0)) for row in rows)
-        run.finish({"rows": rows, **origin(), "evaluations": evaluations})
+        run.finish({"rows": rows, "evaluations": evaluations})
 
 
 def tiled(model: dt.Model, tiles: int) -> dt.SDF:

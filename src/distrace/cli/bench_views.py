@@ -8,7 +8,7 @@ from distrace.benchmarks.pictures import pictures_of
 from distrace.benchmarks.random_views import RandomView, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
-from distrace.cli.console import Run, origin, progress
+from distrace.cli.console import Run, progress
 from distrace.render import STRATEGIES
 from distrace.shading import grid, save_png
 
@@ -69,4 +69,4 @@ def bench_views(run: Run, plan: Plan) -> None:
     facts = {"strategy": strategy, "seed": plan.seed, "views": plan.views, "sizes": list(plan.sizes)}
     content = {"rows": [asdict(row) for row in rows], "summary": [asdict(line) for line in lines]}
     passed = sum(not row.fails for row in rows)
-    run.finish({**content, **facts, **origin(), **evaluations}, f"{passed} of {len(rows)} views pass")
+    run.finish({**content, **facts, **evaluations}, f"{passed} of {len(rows)} views pass")

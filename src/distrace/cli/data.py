@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 import tyro
 
 from distrace.cli.common import Flag, default
-from distrace.cli.console import console, origin, progress, start
+from distrace.cli.console import console, progress, start
 from distrace.data import furniture, planes, sampling
 from distrace.data.debian import catalogue_package, catalogue_summary
 from distrace.data.samples import Doubt
@@ -65,7 +65,7 @@ class Sample:
         reports = sampled(jobs, self.workers)
         rows = [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
         usable = sum(report.usable for report in reports)
-        run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows, **origin()})
+        run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows})
 
 
 def sampled(jobs: list[sampling.Job], workers: int) -> list[Doubt]:
