@@ -11,14 +11,14 @@ from torch import Tensor
 
 from distrace.boundary import shade
 from distrace.camera import Camera
-from distrace.data.photographs import Photograph, Placement, load_photographs
+from distrace.data.photographs import Photograph, UnitSphere, load_photographs
 from distrace.fields.primitives import sphere
 from distrace.rays import meet_sphere
 from distrace.render import render
 from distrace.tracing.sphere_tracing import TraceConfig
 
 EXACT = TraceConfig(coarse_levels=0, tolerance=1e-5, steps=200)  # of few pixels several times as fast as `fast`
-WORLD = Placement(torch.tensor([2.0, -3.0, 40.0], dtype=torch.float64), 5.0)
+WORLD = UnitSphere(torch.tensor([2.0, -3.0, 40.0], dtype=torch.float64), 5.0)
 POINT = torch.tensor([0.2, -0.1, 0.3], dtype=torch.float64)  # in the unit sphere
 SIZES = ((24, 32), (20, 30), (24, 32), (27, 22))
 
@@ -96,12 +96,12 @@ def reads_back(folder: Path, layout: str, shift: float = 0.0) -> None:
         assert (view.camera.height, view.camera.width) == (camera.height, camera.width)
         np.testing.assert_array_equal((view.image * 255).round().byte().numpy(), colours(camera, k))
         expected, depth = camera.project(point_world)
-        pixel, unit_depth = view.camera.project(loaded.placement.to_unit(point_world).float())
+        pixel, unit_depth = view.camera.project(loaded.unit_sphere.to_unit(point_world).float())
         torch.testing.assert_close(pixel.double(), expected + shift, atol=2e-3, rtol=0)
-        torch.testing.assert_close(unit_depth.double() * loaded.placement.radius, depth, atol=1e-3, rtol=0)
+        torch.testing.assert_close(unit_depth.double() * loaded.unit_sphere.radius, depth, atol=1e-3, rtol=0)
         rays, expected_rays = view.camera.rays(camera.pixels().float() + shift), camera.rays()
         torch.testing.assert_close(rays.directions.double(), expected_rays.directions, atol=1e-5, rtol=0)
-        origins = loaded.placement.to_world(rays.origins.double())
+        origins = loaded.unit_sphere.to_world(rays.origins.double())
         torch.testing.assert_close(origins, expected_rays.origins, atol=1e-4, rtol=0)
 
 

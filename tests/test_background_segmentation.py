@@ -10,7 +10,7 @@ from torch.nn.functional import avg_pool2d
 from distrace.camera import Camera
 from distrace.data.background_segmentation import dark_masks, masked
 from distrace.data.photograph import Photograph
-from distrace.data.photographs import Photographs, Placement
+from distrace.data.photographs import Photographs, UnitSphere
 
 
 def ball(size: int = 160, radius: float = 40.0) -> Tensor:
@@ -68,8 +68,8 @@ def around() -> Photographs:
     cameras = [Camera.orbit(90 * k, 10, 3.0, height=160, width=160, focal_px=240.0) for k in range(4)]
     views = [Photograph(f"{k}", camera, image) for k, camera in enumerate(cameras)]
     half = ball(radius=20.0)
-    placement = Placement(torch.zeros(3).double(), 1.0)
-    return Photographs((replace(views[0], mask=half), *views[1:]), placement, "ours")
+    unit_sphere = UnitSphere(torch.zeros(3).double(), 1.0)
+    return Photographs((replace(views[0], mask=half), *views[1:]), unit_sphere, "ours")
 
 
 def test_masks_that_are_given_stay_and_so_does_a_unit_sphere_that_was_told() -> None:
@@ -78,7 +78,7 @@ def test_masks_that_are_given_stay_and_so_does_a_unit_sphere_that_was_told() -> 
         found = masked(replace(given, sphere_known=known))
         assert torch.equal(found.views[0].known_mask, given.views[0].known_mask)
         assert all(view.known_mask.any() for view in found.views)
-        assert (found.placement.radius == given.placement.radius) == known
+        assert (found.unit_sphere.radius == given.unit_sphere.radius) == known
 
 
 def test_black_images_end_in_one_sentence() -> None:

@@ -30,7 +30,7 @@ from distrace.pose import turned_object, zoomed
 from distrace.rays import meet_sphere
 from distrace.render import Buffers, render
 from distrace.training.config import TrainConfig
-from distrace.training.trainer import start, train
+from distrace.training.trainer import start_training, train
 
 RADII = (0.45, 0.6)
 COMMON = {"seconds", "device", "version"}
@@ -42,7 +42,7 @@ def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two spheres, learnt in a second."""
     folder = tmp_path_factory.mktemp("models") / "spheres"
     samples, config = spheres(*RADII), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
-    training = start(2, SPECS, config, torch.device("cpu"))
+    training = start_training(2, SPECS, config, torch.device("cpu"))
     for _ in train(samples, training, config):
         pass
     save_experiment(folder, training.decoder, training.codes, tuple(samples.names))
@@ -599,6 +599,8 @@ BAD = [
     ("complete {model} {tmp}/a.png {tmp}/b.png --poses {tmp}/text --intrinsics 9,9,4,4", "--poses names 1 files"),
     ("complete {model} {tmp}/a.png {tmp}/b.ply --intrinsics 9,9,4,4", "b.ply (a cloud) were given together"),
     ("complete {model} {tmp}/a.npz {tmp}/b.ply", "observations of one world, or clouds in one frame"),
+    ("complete {model}", "no input was given; give a depth image"),
+    ("complete {model} --frame canonical", "0 inputs were given; give one"),
     ("complete {model} {view} {view}", "2 inputs were given; give one, or --frame input"),
     ("complete {model} {view} --seed -1", "--seed -1 was given; a number from 0"),
     ("complete {model} {silhouette} --ignore mask", "silhouette.npz: without its mask it shows nothing"),

@@ -116,4 +116,3 @@ def test_a_part_keeps_points_and_normals_together() -> None:
     assert part.normals is not None
     assert torch.equal(part.points, part.normals)
     assert len(part.points) == 7
-    assert part.without("normal").normals is None

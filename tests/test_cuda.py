@@ -8,14 +8,14 @@ from test_train import CONFIG, SPECS, spheres
 
 from distrace.training import trainer as training
 from distrace.training.config import TrainConfig
-from distrace.training.trainer import start, train
+from distrace.training.trainer import start_training, train
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
 
 
 def losses(config: TrainConfig) -> list[float]:
     device, samples = torch.device("cuda"), spheres(0.3, 0.6)
-    run = train(samples.to(device), start(len(samples.names), SPECS, config, device), config)
+    run = train(samples.to(device), start_training(len(samples.names), SPECS, config, device), config)
     return [step.loss for step in run]
 
 

@@ -16,7 +16,7 @@ from distrace.cli import multiview, parsed, pose
 from distrace.data.observation import View
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import Photographs, save_photographs
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.render import render
@@ -110,8 +110,8 @@ def photographs(model: Path, tmp_path: Path) -> Path:
             seen = render(load_model(model).field(1), camera)
         image = torch.where(seen.mask[..., None], 0.5 + 0.4 * seen.normal, 0.1)
         views.append(Photograph(f"{k}", camera, image, seen.mask if k == 0 else None))
-    placement = Placement(torch.zeros(3).double(), 1.0)
-    save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
+    unit_sphere = UnitSphere(torch.zeros(3).double(), 1.0)
+    save_photographs(tmp_path / "views", Photographs(tuple(views), unit_sphere, "ours"))
     return tmp_path / "views"
 
 

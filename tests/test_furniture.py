@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from distrace.data.debian import Mesh, fetch, listed, summary, write_catalogue
+from distrace.data.debian import MeshEntry, catalogue_package, catalogue_summary, fetch, write_catalogue
 from distrace.data.furniture import PACKAGE, catalogue
 
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n"
@@ -79,10 +79,10 @@ def files(folder: Path) -> dict[str, int]:
 def test_the_catalogue_lists_every_obj_with_creator_and_licence(deb, tmp_path):
     home = Path("sweethome3d-furniture")
     expected = [
-        Mesh("other", "Desk lamp", "Ann & Bob", "CC-BY-3.0-US", str(home), home / "Other/other/lamp.obj"),
-        Mesh("bed", "Captain's bed", "Jane", "CC0-1.0", str(home), home / "Zero/zero/bed/bed.obj"),
-        Mesh("other", "Bill 10€", "Doug C", "CC0-1.0", str(home), home / "Zero/zero/bill/bill.obj"),
-        Mesh("car", "Ford", "various authors", "CC0-1.0", str(home), home / "Zero/zero/ford/ford.obj"),
+        MeshEntry("other", "Desk lamp", "Ann & Bob", "CC-BY-3.0-US", str(home), home / "Other/other/lamp.obj"),
+        MeshEntry("bed", "Captain's bed", "Jane", "CC0-1.0", str(home), home / "Zero/zero/bed/bed.obj"),
+        MeshEntry("other", "Bill 10€", "Doug C", "CC0-1.0", str(home), home / "Zero/zero/bill/bill.obj"),
+        MeshEntry("car", "Ford", "various authors", "CC0-1.0", str(home), home / "Zero/zero/ford/ford.obj"),
     ]
     meshes = catalogue(deb, tmp_path / "out")
     assert meshes == expected
@@ -91,7 +91,7 @@ def test_the_catalogue_lists_every_obj_with_creator_and_licence(deb, tmp_path):
 
 
 def test_the_summary_counts_categories_and_licences(deb, tmp_path):
-    text = summary(catalogue(deb, tmp_path))
+    text = catalogue_summary(catalogue(deb, tmp_path))
     assert text.startswith("4 meshes (2 other, ")
     assert "3 CC0-1.0" in text
 
@@ -104,14 +104,14 @@ def test_a_link_in_place_of_the_table_or_of_what_is_unpacked_is_replaced_not_fol
     (out / "shapes.csv").symlink_to(elsewhere / "passwd")
     (out / f".{PACKAGE}.partial").symlink_to(elsewhere)
     (out / PACKAGE).symlink_to(tmp_path / "nowhere")
-    listed(PACKAGE, catalogue, out, deb)
+    catalogue_package(PACKAGE, catalogue, out, deb)
     assert {path.name: path.read_text() for path in elsewhere.iterdir()} == {"passwd": "root"}
     assert not any(path.is_symlink() for path in out.iterdir())
     assert (out / "shapes.csv").read_text().startswith("category,name")
 
 
 def test_a_table_whose_writing_fails_stays_as_it_was(deb, tmp_path, monkeypatch):
-    meshes = listed(PACKAGE, catalogue, tmp_path, deb)
+    meshes = catalogue_package(PACKAGE, catalogue, tmp_path, deb)
     before = (tmp_path / "shapes.csv").read_text()
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left on device"):
@@ -126,11 +126,11 @@ def full_disk(*given: object) -> None:
 def test_a_full_disk_is_called_full_and_no_download_is_blamed(deb, tmp_path, monkeypatch):
     monkeypatch.setattr(shutil, "copyfileobj", full_disk)
     with pytest.raises(OSError, match=r"^\[Errno \d+\] No space left on device$"):
-        listed(PACKAGE, catalogue, tmp_path / "out", deb)
+        catalogue_package(PACKAGE, catalogue, tmp_path / "out", deb)
 
 
 def test_the_table_is_written(deb, tmp_path):
-    meshes = listed(PACKAGE, catalogue, tmp_path / "new/out", deb)
+    meshes = catalogue_package(PACKAGE, catalogue, tmp_path / "new/out", deb)
     with (tmp_path / "new/out/shapes.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert list(rows[0]) == ["category", "name", "creator", "licence", "debian_package", "path"]
@@ -146,7 +146,7 @@ def test_the_table_is_written(deb, tmp_path):
 
 
 def test_names_with_commas_and_quotes_survive_the_table(tmp_path):
-    mesh = Mesh("other", 'Plate, "glass"\nand cutlery', "Ann", "CC0-1.0", "p", Path("a.obj"))
+    mesh = MeshEntry("other", 'Plate, "glass"\nand cutlery', "Ann", "CC0-1.0", "p", Path("a.obj"))
     write_catalogue([mesh], tmp_path / "shapes.csv")
     with (tmp_path / "shapes.csv").open(newline="", encoding="utf-8") as file:
         assert next(csv.DictReader(file))["name"] == mesh.name
@@ -217,7 +217,7 @@ def test_a_broken_shelf_inside_the_package_is_named(tmp_path):
 
 def test_an_out_that_is_a_file_is_refused(deb):
     with pytest.raises(ValueError, match="choose another --out"):
-        listed(PACKAGE, catalogue, deb, deb)
+        catalogue_package(PACKAGE, catalogue, deb, deb)
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from distrace.camera import Camera
-from distrace.checking.differences import derivatives, differences
+from distrace.checking.differences import differences, image_derivatives
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, check_gradients, compare
 from distrace.checking.moves import all_moves, decoder_changes, in_double, own_changes
 from distrace.checking.retrace import DOUBLE, SINGLE, STEP_OF_VIEW, Footprints, Retraced, minimum_near, root_near
@@ -285,13 +285,13 @@ def test_what_cannot_be_checked_is_refused() -> None:
 def test_derivatives_are_those_of_every_element_and_zero_where_there_is_no_way() -> None:
     like, x = torch.zeros((), dtype=torch.float64), torch.arange(4, dtype=torch.float64)
     images = lambda h: {"sine": torch.sin(x + h), "none": x, "product": x * (3 * h)}  # noqa: E731
-    found = derivatives(images, like)
+    found = image_derivatives(images, like)
     central, bend = differences(images, images(like), 1e-5, like)
     for name, expected in {"sine": x.cos(), "none": 0 * x, "product": 3 * x}.items():
         torch.testing.assert_close(found[name], expected)
         torch.testing.assert_close(central[name], expected, rtol=0, atol=1e-9)
         assert bend[name].abs().max() < 1e-4
-    assert derivatives(lambda h: {"none": x}, like)["none"].eq(0).all()
+    assert image_derivatives(lambda h: {"none": x}, like)["none"].eq(0).all()
 
 
 def test_the_root_near_a_hit_is_found_or_none_is_claimed() -> None:

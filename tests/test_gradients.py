@@ -9,7 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from distrace.camera import Camera
-from distrace.checking.differences import Images, derivatives
+from distrace.checking.differences import Images, image_derivatives
 from distrace.checking.gradcheck import check_gradients
 from distrace.checking.moves import Move, all_moves
 from distrace.checking.retrace import DOUBLE, Retraced
@@ -105,8 +105,8 @@ def test_the_cameras_derivatives_are_those_of_the_closed_form(parameter: str) ->
     sdf = FIELDS["sphere"][0]
     view, moves = met(sdf, VIEW, parameter)
     for move in moves.values():
-        attached = derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
-        closed = derivatives(
+        attached = image_derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
+        closed = image_derivatives(
             lambda h, move=move: of_sphere(move(h)[1], CENTRE, CENTRE.new_tensor(RADIUS), view.trace.hit), view.slope
         )
         assert_same(attached, closed, 1e-3)
@@ -117,8 +117,8 @@ def test_the_placements_derivatives_are_those_of_the_closed_form() -> None:
     view, moves = met(sdf, VIEW, "placement")
     assert len(moves) == 7
     for along, move in moves.items():
-        attached = derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
-        closed = derivatives(
+        attached = image_derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
+        closed = image_derivatives(
             lambda h, along=along: of_sphere(
                 VIEW, *transformed(torch.linalg.matrix_exp(h * generator(along))), view.trace.hit
             ),
@@ -142,8 +142,8 @@ def test_on_a_face_of_a_box_they_are_those_of_its_plane(parameter: str) -> None:
     assert roof.sum() > 50
     among, largest = roof[view.trace.hit], 0.0
     for move in moves.values():
-        attached = derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
-        closed = derivatives(lambda h, move=move: of_plane(move(h)[1], HALF[1], roof), view.slope)
+        attached = image_derivatives(lambda h, move=move: view.attached(*move(h)), view.slope)
+        closed = image_derivatives(lambda h, move=move: of_plane(move(h)[1], HALF[1], roof), view.slope)
         for name in ("distance", "depth", "hit points", "normal"):
             torch.testing.assert_close(attached[name][among], closed[name], rtol=1e-8, atol=1e-8, msg=name)
         largest = max(largest, float(closed["distance"].abs().max()))

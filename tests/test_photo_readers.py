@@ -26,7 +26,8 @@ from PIL import Image
 
 from distrace.camera import Camera
 from distrace.data.photo_readers.idr import decomposed
-from distrace.data.photo_readers.transforms import save_cameras
+from distrace.data.photo_readers.transforms import save_transforms
+from distrace.data.photograph import Source
 from distrace.data.photographs import load_photographs, notes
 from distrace.errors import DoubtfulResult
 
@@ -72,17 +73,60 @@ def test_transforms_with_intrinsics_for_each_frame_are_read(tmp_path: Path) -> N
     reads_back(frames(tmp_path), "transforms.json")
 
 
-def test_cameras_are_saved_by_paths_of_existing_files_and_to_the_last_digit(tmp_path: Path) -> None:
+def sources_of(folder: Path) -> dict[str, Source]:
+    return {view.name: view.source for view in load_photographs(folder).views if view.source is not None}
+
+
+def test_saved_transforms_have_cameras_to_the_last_digit(tmp_path: Path) -> None:
     given = frames(tmp_path / "photographs")
-    sources = [view.source for view in load_photographs(given).views if view.source is not None]
-    saved = tmp_path / "out" / "cameras" / "transforms.json"
-    save_cameras(saved, {source.file: source.camera for source in sources})
+    save_transforms(tmp_path / "out", sources_of(given))
     before = json.loads((given / "transforms.json").read_text())["frames"]
-    after = json.loads(saved.read_text())["frames"]
-    assert [entry["file_path"] for entry in after] == [f"../../photographs/images/view{k}.png" for k in range(4)]
-    for entry, old in zip(after, before, strict=True):
-        assert (saved.parent / entry["file_path"]).is_file()
-        assert entry == {**old, "file_path": entry["file_path"]}
+    after = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert after == [{**old, "file_path": f"images/view{k}.png"} for k, old in enumerate(before)]
+
+
+@pytest.mark.parametrize("masks", ["alpha", "files"])
+def test_saved_transforms_are_read_back_with_their_images_and_masks(tmp_path: Path, masks: str) -> None:
+    given = tmp_path / "photographs"
+    given.mkdir()
+    if masks == "alpha":
+        angles(given)
+    else:
+        write_masks(given / "masks")
+        frames(given, with_masks)
+    save_transforms(tmp_path / "out", sources_of(given))
+    same_photographs(given, tmp_path / "out")
+
+
+def same_photographs(first: Path, second: Path) -> None:
+    for before, after in zip(load_photographs(first).views, load_photographs(second).views, strict=True):
+        assert after.name == before.name
+        assert torch.equal(after.image, before.image)
+        assert torch.equal(after.known_mask, before.known_mask)
+        assert torch.equal(after.camera.intrinsics, before.camera.intrinsics)
+        torch.testing.assert_close(after.camera.T_world_camera, before.camera.T_world_camera)
+
+
+def test_saving_transforms_beside_their_photographs_changes_no_file(tmp_path: Path) -> None:
+    write_masks(tmp_path / "masks")
+    frames(tmp_path, with_masks)
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*.png")}
+    save_transforms(tmp_path, sources_of(tmp_path))
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*.png")} == before
+    assert all(view.mask is not None for view in load_photographs(tmp_path).views)
+
+
+def test_saved_photographs_of_one_name_stay_apart(tmp_path: Path) -> None:
+    given = frames(tmp_path / "photographs")
+    content = json.loads((given / "transforms.json").read_text())
+    for k, entry in enumerate(content["frames"]):
+        (given / str(k)).mkdir()
+        shutil.move(given / entry["file_path"], given / f"{k}/photograph.png")
+        entry["file_path"] = f"{k}/photograph.png"
+    (given / "transforms.json").write_text(json.dumps(content))
+    save_transforms(tmp_path / "out", sources_of(given))
+    for k, view in enumerate(load_photographs(tmp_path / "out").views):
+        np.testing.assert_array_equal((view.image * 255).round().byte().numpy(), colours(cameras()[k], k))
 
 
 def test_terms_and_flags_that_say_nothing_are_no_obstacle(tmp_path: Path) -> None:
@@ -96,11 +140,16 @@ def test_transforms_with_one_angle_are_read_and_alpha_is_the_mask(tmp_path: Path
     loaded = load_photographs(angles(tmp_path))
     assert loaded.layout == "transforms_train.json"
     for k, view in enumerate(loaded.views):
-        camera = loaded.placement.camera_to_world(view.camera)
+        camera = loaded.unit_sphere.camera_to_world(view.camera)
         torch.testing.assert_close(camera.rays().directions, angled(k).rays().directions.float(), atol=1e-5, rtol=0)
         torch.testing.assert_close(camera.rays().origins, angled(k).rays().origins.float(), atol=1e-4, rtol=0)
         assert view.mask is not None
         assert torch.equal(view.mask, ball(angled(k)))
+
+
+def with_masks(content: dict) -> None:
+    for k, entry in enumerate(content["frames"]):
+        entry["mask_path"] = f"masks/view{k}.png"
 
 
 def test_what_is_told_for_all_frames_holds_for_each_and_masks_are_read(tmp_path: Path) -> None:
@@ -190,9 +239,9 @@ def model(
 @pytest.mark.parametrize("place", ["sparse/0", "sparse", "."])
 def test_models_of_colmap_are_read_and_their_points_tell_the_sphere(tmp_path: Path, kind: str, place: str) -> None:
     reads_back(model(tmp_path, kind, place), "COLMAP")
-    placement = load_photographs(tmp_path).placement
-    assert (placement.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
-    assert 0.5 < placement.radius / WORLD.radius < 1.2
+    unit_sphere = load_photographs(tmp_path).unit_sphere
+    assert (unit_sphere.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
+    assert 0.5 < unit_sphere.radius / WORLD.radius < 1.2
 
 
 @pytest.mark.parametrize("kind", ["text", "binary"])
@@ -219,8 +268,8 @@ def test_lines_of_images_without_the_empty_ones_are_read(tmp_path: Path) -> None
 
 
 def test_models_of_few_points_are_placed_by_their_views(tmp_path: Path) -> None:
-    placement = load_photographs(model(tmp_path, "text", points=3)).placement
-    assert (placement.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
+    unit_sphere = load_photographs(model(tmp_path, "text", points=3)).unit_sphere
+    assert (unit_sphere.centre - WORLD.centre).norm() < 0.2 * WORLD.radius
 
 
 def test_older_models_without_rigs_are_read(tmp_path: Path) -> None:
@@ -283,9 +332,9 @@ def projections(folder: Path, **changed: object) -> Path:
 
 def test_projections_of_idr_are_read(tmp_path: Path) -> None:
     reads_back(projections(tmp_path), "IDR")
-    placement = load_photographs(tmp_path).placement
-    assert torch.equal(placement.centre, WORLD.centre)
-    assert placement.radius == WORLD.radius
+    unit_sphere = load_photographs(tmp_path).unit_sphere
+    assert torch.equal(unit_sphere.centre, WORLD.centre)
+    assert unit_sphere.radius == WORLD.radius
 
 
 def test_a_unit_sphere_smaller_than_the_object_is_noted(tmp_path: Path) -> None:

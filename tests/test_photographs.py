@@ -25,7 +25,7 @@ from photographed import (
 from PIL import Image
 
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes, save_photographs
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.rays import meet_sphere
 
 SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"  # beside the repository, where there is one
@@ -53,7 +53,7 @@ def own(folder: Path, change: Callable[[dict], object] = lambda content: None) -
 def test_our_own_layout_is_read(tmp_path: Path) -> None:
     reads_back(own(tmp_path), "views.json")
     loaded = load_photographs(tmp_path)
-    assert (loaded.placement.centre.tolist(), loaded.placement.radius) == ([2.0, -3.0, 40.0], 5.0)
+    assert (loaded.unit_sphere.centre.tolist(), loaded.unit_sphere.radius) == ([2.0, -3.0, 40.0], 5.0)
     for view, camera in zip(loaded.views, cameras()):
         assert view.mask is not None
         assert torch.equal(view.mask, ball(camera))
@@ -66,8 +66,8 @@ def test_photographs_are_read_as_they_were_saved(tmp_path: Path, masks: bool) ->
     views = [replace(view, camera=replace(view.camera, intrinsics=view.camera.intrinsics.float())) for view in views]
     save_photographs(tmp_path, Photographs(tuple(views), WORLD, "views.json"))
     loaded = load_photographs(tmp_path)
-    assert loaded.placement.radius == WORLD.radius
-    assert torch.equal(loaded.placement.centre, WORLD.centre)
+    assert loaded.unit_sphere.radius == WORLD.radius
+    assert torch.equal(loaded.unit_sphere.centre, WORLD.centre)
     for view, read in zip(views, loaded.views):
         assert read.name == view.name
         assert torch.equal(read.image, view.image)
@@ -98,9 +98,9 @@ def test_photographs_of_one_name_in_several_folders_are_told_apart(tmp_path: Pat
 
 def test_without_a_unit_sphere_it_is_around_what_the_masks_show(tmp_path: Path) -> None:
     loaded = load_photographs(own(tmp_path, lambda content: content.pop("unit_sphere")))
-    away = (loaded.placement.centre - WORLD.centre).norm().item()
+    away = (loaded.unit_sphere.centre - WORLD.centre).norm().item()
     assert away < 0.25 * WORLD.radius
-    assert 0.5 * WORLD.radius < loaded.placement.radius + away < 1.1 * WORLD.radius, "a ball of half the radius"
+    assert 0.5 * WORLD.radius < loaded.unit_sphere.radius + away < 1.1 * WORLD.radius, "a ball of half the radius"
 
 
 @pytest.mark.parametrize("factor", [1.0, 0.5, 0.3, 0.1])
@@ -186,7 +186,7 @@ def test_views_that_look_wrong_are_noted() -> None:
     grey = replace(first, image=torch.full_like(first.image, 0.4))
     white = replace(second, image=torch.where(torch.rand(*SIZES[1], 1) < 0.05, second.image, 1.0))
     empty = replace(third, mask=torch.zeros_like(ball(third.camera)))
-    inside = replace(fourth, camera=Placement(torch.zeros(3).double(), 10.0).camera_to_unit(fourth.camera))
+    inside = replace(fourth, camera=UnitSphere(torch.zeros(3).double(), 10.0).camera_to_unit(fourth.camera))
     assert notes(Photographs((first, second, third, fourth), WORLD, "")) == []
     found = notes(Photographs((grey, white, empty, inside), WORLD, ""))
     words = ("view0 is of one colour", "view1 is fully white", "view2 has a mask that marks no", "view3 was taken from")
@@ -221,7 +221,7 @@ def test_the_temple_lies_in_the_sphere_that_its_cameras_look_at() -> None:
     assert all_see_the_sphere(loaded.views)
     low, high = torch.tensor([[-0.073568, 0.021728, -0.012445], [0.028855, 0.181892, 0.062736]]).double()
     corners = torch.cartesian_prod(*torch.stack([low, high], dim=1))
-    assert (loaded.placement.to_unit(corners).norm(dim=-1) < 1).all(), "the tight bounding box of its README"
+    assert (loaded.unit_sphere.to_unit(corners).norm(dim=-1) < 1).all(), "the tight bounding box of its README"
 
 
 @pytest.mark.skipif(not scan().is_dir(), reason="DTU's scan 24 is not here")

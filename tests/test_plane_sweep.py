@@ -17,7 +17,7 @@ from distrace.reconstruction.multiview_depth import (
     NO_DEPTHS,
     ConsistentDepths,
     DepthMap,
-    depth_loss,
+    consistent_depth_loss,
     plane_sweep,
 )
 from distrace.reconstruction.networks import SurfaceSpecs
@@ -82,9 +82,9 @@ def test_consistent_depths_lie_on_the_surface(maps: list[DepthMap], depths: Cons
 
 def test_the_depth_loss_is_higher_where_a_hollow_is_filled_or_a_part_is_missing(depths: ConsistentDepths) -> None:
     points = depths.sample(2000, torch.Generator().manual_seed(0))
-    true = depth_loss(BOWL(points))
-    assert depth_loss(sphere(0.8)(points)) > 3 * true
-    assert depth_loss(BOWL(points) + 0.1) > 3 * true
+    true = consistent_depth_loss(BOWL(points))
+    assert consistent_depth_loss(sphere(0.8)(points)) > 3 * true
+    assert consistent_depth_loss(BOWL(points) + 0.1) > 3 * true
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 from test_furniture import write_deb
 
 from distrace.data.ac3d import load_ac3d, load_surfaces
-from distrace.data.debian import listed
+from distrace.data.debian import catalogue_package
 from distrace.data.mesh_files import load_soup
 from distrace.data.planes import PACKAGE, PARKED_PACKAGE, catalogue, parked
 from distrace.data.solid import load_solid
@@ -108,7 +108,7 @@ def test_each_aircraft_has_one_mesh_the_one_with_most_in_it(deb: Path, tmp_path:
 
 
 def test_meshes_and_the_copyright_are_kept_and_nothing_else(deb: Path, tmp_path: Path) -> None:
-    listed(PACKAGE, catalogue, tmp_path / "out", deb)
+    catalogue_package(PACKAGE, catalogue, tmp_path / "out", deb)
     home = tmp_path / "out/flightgear-data-ai"
     assert (home / "copyright").read_text() == "as they say\n"
     assert not list(home.rglob("*.xml"))
@@ -149,7 +149,7 @@ def test_each_parked_mesh_is_listed_with_its_images_and_nothing_else_of_the_pack
         f"{root}/Airport/tower.ac": HEAD + poly([TRIANGLE]),
     }
     deb = write_deb(tmp_path / "flightgear-data-base_1_all.deb", {name: text.encode() for name, text in files.items()})
-    meshes = listed(PARKED_PACKAGE, parked, tmp_path / "out", deb)
+    meshes = catalogue_package(PARKED_PACKAGE, parked, tmp_path / "out", deb)
     assert [(mesh.name, mesh.licence) for mesh in meshes] == [(name, "GPL-2.0-or-later") for name in ("jet", "trailer")]
     assert all(len(load_ac3d(tmp_path / "out" / mesh.path)) for mesh in meshes)
     kept = {path.name for path in (tmp_path / "out/flightgear-data-base").iterdir()}

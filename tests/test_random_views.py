@@ -11,7 +11,16 @@ from distrace.benchmarks import agreement as views
 from distrace.benchmarks.agreement import ViewRow, badness, largest_part, measure_view, summaries
 from distrace.benchmarks.measuring import reference_depth, reference_distance
 from distrace.benchmarks.pictures import pictures_of
-from distrace.benchmarks.random_views import DISTANCES, FOCALS_MM, Mixture, Shot, View, aimed, draw_shot, model_views
+from distrace.benchmarks.random_views import (
+    DISTANCES,
+    FOCALS_MM,
+    Mixture,
+    RandomView,
+    Shot,
+    aim_at_surface,
+    draw_shot,
+    model_views,
+)
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model, load_model
 from distrace.fields.decoder import Decoder, NetworkSpecs
@@ -23,7 +32,7 @@ from distrace.tracing.sphere_tracing import DYNAMIC
 SIZES = (16, 32)
 SHOT = Shot(azimuth=20.0, elevation=10.0, distance=3.0, focal_mm=40.0, target=(0.0, 0.0, 0.0), size=64)
 CAUTIOUS = replace(DYNAMIC, steps=2000, tolerance=1e-6, step_scale=0.9)
-BALL = View("ball", None, sphere(0.5), SHOT)
+BALL = RandomView("ball", None, sphere(0.5), SHOT)
 
 
 @pytest.fixture(scope="module")
@@ -84,12 +93,12 @@ def test_a_shot_stands_where_it_says_and_has_its_target_in_the_middle() -> None:
 
 def test_a_camera_aims_at_the_surface() -> None:
     solid = box(torch.tensor([0.5, 0.02, 0.3]))
-    targets = [torch.tensor(aimed(SHOT, solid, np.random.default_rng(seed)).target) for seed in range(5)]
+    targets = [torch.tensor(aim_at_surface(SHOT, solid, np.random.default_rng(seed)).target) for seed in range(5)]
     assert all(solid(target[None]).abs() < 1e-3 for target in targets)
     assert len({tuple(target.tolist()) for target in targets}) == 5
 
 
-def wrong_by(monkeypatch: pytest.MonkeyPatch, shown, view: View = BALL) -> ViewRow:
+def wrong_by(monkeypatch: pytest.MonkeyPatch, shown, view: RandomView = BALL) -> ViewRow:
     """The row of a view where another field is rendered than the reference has."""
     monkeypatch.setattr(views, "render", lambda sdf, camera: render(shown, camera, config=CAUTIOUS))
     return measure_view(view).row
@@ -123,7 +132,7 @@ def test_depths_that_are_off_are_counted_where_both_see_something(monkeypatch: p
 
 
 def test_a_steep_field_is_measured_against_the_same_reference() -> None:
-    steep = View("steep", None, lambda points: torch.tanh(20 * BALL.sdf(points)), SHOT, lipschitz=20.0)
+    steep = RandomView("steep", None, lambda points: torch.tanh(20 * BALL.sdf(points)), SHOT, lipschitz=20.0)
     truth = measure_view(steep, "dynamic", CAUTIOUS).truth
     torch.testing.assert_close(truth, measure_view(BALL, "cautious", CAUTIOUS).truth, atol=1e-5, rtol=0)
 
@@ -189,7 +198,7 @@ def test_the_reference_does_not_look_before_the_ray_begins() -> None:
 
 def test_pictures_are_cropped_to_the_object_and_a_view_with_more_wrong_pixels_is_worse() -> None:
     coarse = replace(CAUTIOUS, steps=3)
-    bad = measure_view(View("ball", Mixture(1, 2, 0.25), sphere(0.5), SHOT), "coarse", coarse)
+    bad = measure_view(RandomView("ball", Mixture(1, 2, 0.25), sphere(0.5), SHOT), "coarse", coarse)
     good = measure_view(BALL, "coarse", CAUTIOUS)
     assert bad.row.fails
     assert badness(bad) > badness(good)
@@ -216,5 +225,7 @@ def test_sizes_that_no_image_has_are_refused() -> None:
 
 
 def test_a_view_of_nothing_has_a_picture_too() -> None:
-    nothing = measure_view(View("nothing", None, sphere(0.5, torch.tensor([0.0, 9, 0])), SHOT), "cautious", CAUTIOUS)
+    nothing = measure_view(
+        RandomView("nothing", None, sphere(0.5, torch.tensor([0.0, 9, 0])), SHOT), "cautious", CAUTIOUS
+    )
     assert all((picture == 255).all() and picture.shape == (256, 256, 3) for picture in pictures_of(nothing))

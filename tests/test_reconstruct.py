@@ -21,12 +21,15 @@ from torch.nn import functional as F
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.cli import main
+from distrace.cli.console import start
 from distrace.cli.reconstruct import parted, without
+from distrace.cli.reconstructed import Reconstructed
 from distrace.data.background_segmentation import masked
 from distrace.data.photograph import Photograph
-from distrace.data.photographs import Photographs, Placement, save_photographs
+from distrace.data.photographs import Photographs, UnitSphere, load_photographs, save_photographs
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.fields.primitives import box, sphere, torus
+from distrace.mesh import MeshConfig
 from distrace.photos.visual_hull import mask_overlaps, visual_hull
 from distrace.pose import exp_se3
 from distrace.rays import Rays, meet_sphere
@@ -51,7 +54,7 @@ from distrace.reconstruction.state import (
     save_reconstruction,
 )
 from distrace.render import render
-from distrace.report.reconstruction_page import judged
+from distrace.report.reconstruction_page import compared_view
 from distrace.surface import attach
 from distrace.tracing.sphere_tracing import sphere_trace
 
@@ -133,8 +136,8 @@ def test_squareplus_is_smooth_and_close_to_relu() -> None:
 
 
 def test_a_fit_renders_a_held_out_view(views: list[Photograph], fitted: Reconstruction) -> None:
-    before = judged(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
-    after = judged(fitted, views[0], 40)
+    before = compared_view(Reconstruction.fresh(SMALL, SHORT, 8, CPU), views[0], 40)
+    after = compared_view(fitted, views[0], 40)
     assert after.silhouette_iou > max(0.9, before.silhouette_iou)
     assert after.psnr > before.psnr + 3
     assert fitted.evaluations > SHORT.steps * SHORT.rays
@@ -166,10 +169,10 @@ def test_colour_refinement_changes_colours_alone(views: list[Photograph], fitted
     config = replace(SHORT, refinement_steps=60)
     state = deepcopy(fitted)
     training = views[1:]
-    before = judged(state, training[0], 40)
+    before = compared_view(state, training[0], 40)
     list(reconstruct(training, state, config))
     assert state.step == config.total == fitted.step + 30
-    after = judged(state, training[0], 40)
+    after = compared_view(state, training[0], 40)
     assert after.psnr > before.psnr
     assert after.silhouette_iou == before.silhouette_iou
     for one, other in zip(state.surface.parameters(), fitted.surface.parameters(), strict=True):
@@ -375,16 +378,16 @@ def test_a_dark_background_gives_masks(views: list[Photograph]) -> None:
         replace(view, image=(view.image + 0.02 * torch.rand(view.image.shape, generator=random)).clamp(0, 1), mask=None)
         for view in views
     ]
-    found = masked(Photographs(tuple(noisy), Placement(torch.zeros(3).double(), 2.0), "ours"))
+    found = masked(Photographs(tuple(noisy), UnitSphere(torch.zeros(3).double(), 2.0), "ours"))
     for view, truth in zip(found.views, views, strict=True):
         assert view.mask is not None
         assert truth.mask is not None
         assert (view.mask & truth.mask).sum() / (view.mask | truth.mask).sum() > 0.9
-        there = found.placement.camera_to_world(view.camera).T_world_camera
+        there = found.unit_sphere.camera_to_world(view.camera).T_world_camera
         assert torch.allclose(there[:3, 3], 2 * truth.camera.T_world_camera[:3, 3], atol=1e-5)
     bright = [replace(view, image=1 - view.image) for view in noisy]
     with pytest.raises(ValueError, match="00 and 7 others have no mask, and their background is not dark"):
-        masked(Photographs(tuple(bright), found.placement, "ours"))
+        masked(Photographs(tuple(bright), found.unit_sphere, "ours"))
 
 
 def test_every_so_manieth_view_is_held_out(views: list[Photograph]) -> None:
@@ -408,8 +411,8 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     monkeypatch.setattr("distrace.cli.reconstruct.PREVIEWS", 2)
     monkeypatch.setattr("distrace.cli.reconstructed.FITTED_SHOWN", 1)
     monkeypatch.setattr("distrace.reconstruction.cameras.STEPS", 5)
-    placement = Placement(torch.tensor([3.0, 0, 0]).double(), 2.0)
-    save_photographs(tmp_path / "views", Photographs(tuple(views), placement, "ours"))
+    unit_sphere = UnitSphere(torch.tensor([3.0, 0, 0]).double(), 2.0)
+    save_photographs(tmp_path / "views", Photographs(tuple(views), unit_sphere, "ours"))
     out = tmp_path / "out"
     few = ["--steps", 30, "--retouching", 5, "--sizes", 16, 32, "--rays", 128, "--width", 16]
     run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4, "--format", "ply", "obj")
@@ -429,11 +432,32 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
         assert len(np.unique(np.asarray(mesh.visual.vertex_colors), axis=0)) > 1
 
 
+def test_views_that_were_read_from_no_file_are_saved_without_transforms(
+    views: list[Photograph], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("distrace.cli.reconstructed.FITTED_SHOWN", 1)
+    unit_sphere = UnitSphere(torch.tensor([3.0, 0, 0]).double(), 2.0)
+    few = views[:2]
+    save_photographs(tmp_path / "views", Photographs(tuple(few), unit_sphere, "ours"))
+    read = load_photographs(tmp_path / "views").views[0]
+    config = replace(SHORT, sizes=(16,))
+    state = Reconstruction.fresh(SMALL, config, len(few), CPU)
+    found = Reconstructed("balls", state, config, unit_sphere, [read, few[1]], [])
+    found.save(start(tmp_path / "out"), MeshConfig(16), ["ply"])
+    cameras = json.loads((tmp_path / "out" / "result.json").read_text())["cameras"]
+    assert list(cameras) == [view.name for view in few]
+    for view in few:
+        expected = unit_sphere.camera_to_world(view.camera).T_world_camera
+        torch.testing.assert_close(torch.tensor(cameras[view.name]["T_world_camera"]), expected)
+    frames = json.loads((tmp_path / "out" / "transforms.json").read_text())["frames"]
+    assert [frame["file_path"] for frame in frames] == ["images/00.png"]
+
+
 def test_photographs_without_masks_end_in_one_sentence(
     views: list[Photograph], tmp_path: Path, run: Command, capsys: pytest.CaptureFixture
 ) -> None:
     bright = tuple(replace(view, image=1 - view.image, mask=None) for view in views)
-    save_photographs(tmp_path / "views", Photographs(bright, Placement(torch.zeros(3).double(), 1.0), "ours"))
+    save_photographs(tmp_path / "views", Photographs(bright, UnitSphere(torch.zeros(3).double(), 1.0), "ours"))
     with pytest.raises(SystemExit) as stop:
         run(tmp_path / "views", "--out", tmp_path / "o")
     assert stop.value.code == 2

@@ -23,7 +23,7 @@ from distrace.metrics import Chamfer
 from distrace.render import render
 from distrace.report import charts, scene
 from distrace.report import page as html
-from distrace.report.completion_page import Completion, View, completion_page
+from distrace.report.completion_page import Completion, RenderedView, completion_page
 
 VOID = {"meta", "link", "img", "br", "path", "use"}
 
@@ -60,9 +60,10 @@ class Reader(HTMLParser):
         return [attributes for name, attributes in self.tags if name == tag]
 
 
-def view(radius: float) -> View:
+def view(radius: float) -> RenderedView:
     with torch.no_grad():
-        return View.of(render(sphere(radius), Camera.orbit(30, 20, 4.0, height=48, width=48)))
+        camera = Camera.orbit(30, 20, 4.0, height=48, width=48)
+        return RenderedView.of(render(sphere(radius), camera), camera)
 
 
 @pytest.fixture(scope="module")

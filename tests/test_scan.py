@@ -210,3 +210,5 @@ def test_a_box_outside_of_the_image_is_refused(tmp_path: Path) -> None:
         load_scan([tmp_path / "view.npz"], ScanOptions(box=(5, 5, 200, 20)))
     with pytest.raises(ValueError, match=r"x\.png is a depth image, and needs --intrinsics"):
         load_scan([tmp_path / "x.png"])
+    with pytest.raises(ValueError, match="no input was given; give a depth image"):
+        load_scan([])

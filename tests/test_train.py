@@ -31,7 +31,7 @@ from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
 from distrace.training.fine_tuning import CERTAIN, REACH, Distillation, oversampled
 from distrace.training.losses import training_loss
-from distrace.training.trainer import Step, Training, begin_with, bound_codes, start, train
+from distrace.training.trainer import Training, TrainingStep, begin_with, bound_codes, start_training, train
 
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
@@ -61,7 +61,7 @@ def sample_files(folder: Path, *radii: float) -> Path:
 
 
 def finished(samples: Samples, config: TrainConfig) -> Training:
-    training = start(len(samples.names), SPECS, config, CPU)
+    training = start_training(len(samples.names), SPECS, config, CPU)
     for _ in train(samples, training, config):
         pass
     return training
@@ -92,7 +92,7 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., None]:
 
 def test_a_tiny_network_learns_a_sphere() -> None:
     samples, config = spheres(0.5), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3)
-    training = start(1, SPECS, config, CPU)
+    training = start_training(1, SPECS, config, CPU)
     losses = [step.loss for step in train(samples, training, config)]
     assert sum(losses[-20:]) / 20 < sum(losses[:5]) / 5 / 5, "a fifth of the loss at the start"
     field = training.decoder.eval().field(training.codes[0].detach())
@@ -127,7 +127,7 @@ def test_a_draw_takes_as_many_samples_inside_as_outside_of_every_shape() -> None
 @pytest.mark.parametrize("stop", [1, 7])
 def test_a_run_that_was_stopped_ends_bit_for_bit_like_one_that_was_not(tmp_path: Path, stop: int) -> None:
     samples = spheres(0.3, 0.6)
-    first = start(2, SPECS, CONFIG, CPU)
+    first = start_training(2, SPECS, CONFIG, CPU)
     for _ in islice(train(samples, first, CONFIG), stop):
         pass
     save_training(tmp_path, first, CONFIG, samples.names)
@@ -155,14 +155,14 @@ def test_samples_of_wrong_sign_and_large_errors_count_more() -> None:
 
 def test_a_run_keeps_the_mean_loss_of_every_hundred_steps() -> None:
     samples, config = spheres(0.5), replace(CONFIG, steps=230)
-    training = start(1, SPECS, config, CPU)
+    training = start_training(1, SPECS, config, CPU)
     losses = [step.loss for step in train(samples, training, config)]
     assert training.losses == pytest.approx([mean(losses[:100]), mean(losses[100:200]), mean(losses[200:])])
 
 
 def test_a_run_of_a_version_that_kept_no_losses_goes_on(tmp_path: Path) -> None:
     samples, config = spheres(0.5), replace(CONFIG, steps=130)
-    first = start(1, SPECS, config, CPU)
+    first = start_training(1, SPECS, config, CPU)
     for _ in islice(train(samples, first, config), 120):
         pass
     save_training(tmp_path, first, config, samples.names)
@@ -210,7 +210,7 @@ def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> 
     save_model(tmp_path / "bundled", model := load_model(tmp_path / "trained"))  # without weight norm
     points = samples.outside[0][:50, :3]
     for name in ("trained", "bundled"):
-        second = start(4, SPECS, CONFIG, CPU)
+        second = start_training(4, SPECS, CONFIG, CPU)
         begin_with(second, ["sphere1", "new", "sphere0", "sphere0~warped1"], load_model(tmp_path / name))
         assert_close = torch.testing.assert_close
         assert_close(second.codes[[2, 0]].detach(), model.codes, rtol=1e-3, atol=1e-3)
@@ -282,7 +282,7 @@ def test_a_model_stays_what_it_was_between_its_shapes_if_it_is_to(tmp_path: Path
     points, codes = torch.rand(50, 200, 3) - 0.5, kept.drawn(torch.arange(3).repeat(50)[:50])
     changes = []
     for keep in (0.0, 10.0):
-        training = start(3, SPECS, config, CPU)
+        training = start_training(3, SPECS, config, CPU)
         begin_with(training, names, model)
         for _ in train(replace(spheres(0.3, 0.45, 0.6), names=names), training, replace(config, keep=keep), kept):
             pass
@@ -340,7 +340,7 @@ def test_there_is_no_run_to_go_on_with_in_an_empty_folder(tmp_path: Path) -> Non
 @pytest.mark.parametrize("damage", ["cut", "words", "empty", "other", "other-network", "losses", "step"])
 def test_a_damaged_checkpoint_ends_in_one_sentence(tmp_path: Path, damage: str) -> None:
     path = tmp_path / NAME
-    save_training(tmp_path, start(1, SPECS, CONFIG, CPU), CONFIG, ["a"])
+    save_training(tmp_path, start_training(1, SPECS, CONFIG, CPU), CONFIG, ["a"])
     whole = path.read_bytes()
     changes = {"other-network": {"specs": {"dims": (8, 8)}}, "losses": {"losses": False}, "step": {"step": "some"}}
     if damage == "other":
@@ -355,7 +355,7 @@ def test_a_damaged_checkpoint_ends_in_one_sentence(tmp_path: Path, damage: str) 
 
 
 def test_a_checkpoint_of_other_samples_ends_in_one_sentence(tmp_path: Path) -> None:
-    save_training(tmp_path, start(2, SPECS, CONFIG, CPU), CONFIG, ["a", "b"])
+    save_training(tmp_path, start_training(2, SPECS, CONFIG, CPU), CONFIG, ["a", "b"])
     for names in (["a"], ["a", "c"], ["a", "b", "c"]):
         with pytest.raises(ValueError, match="was trained on 2 files of samples, and now there are") as caught:
             load_training(tmp_path, names, CPU)
@@ -541,7 +541,7 @@ def test_a_training_that_diverges_keeps_what_was_saved_before(tmp_path: Path, ru
     samples, out = sample_files(tmp_path / "samples", 0.5), tmp_path / "model"
     run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
     before = checkpoint(out)
-    lost = lambda *given: iter([Step(4, float("nan"), 0.1)])  # noqa: E731
+    lost = lambda *given: iter([TrainingStep(4, float("nan"), 0.1)])  # noqa: E731
     monkeypatch.setattr(distrace.cli.train, "run_training", lost)
     with pytest.raises(SystemExit):
         run("train", samples, "--out", out, "--steps", "9")

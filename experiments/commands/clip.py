@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from distrace.cli.console import console, origin, progress, start
+from distrace.cli.console import console, progress, start
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
 from experiments.datasets.solids import mesh_of
@@ -53,7 +53,7 @@ class Clip:
         rendered, seconds = render_frames(description, patches, shape.turn, run.out)
         per_frame = {"seconds_per_frame": seconds / rendered} if rendered else {}
         counts = {"frames": description.frames, "rendered": rendered, "cores": os.cpu_count()}
-        run.finish({**counts, **per_frame, **origin()})
+        run.finish({**counts, **per_frame})
 
     def _texture(self, patches: list[Patch], path: Path) -> clip.Texture:
         textured = has_images(patches)

@@ -11,7 +11,7 @@ from distrace.camera import Camera
 from distrace.checkpoints.codes import named_code
 from distrace.cli.bench import finish, rows_of, show
 from distrace.cli.common import CodeName, ModelName, opened, show_table
-from distrace.cli.console import origin, progress, start
+from distrace.cli.console import progress, start
 from distrace.files import save_json, save_text
 from experiments.costs import backward, boundary_gradients, fields, gradients, growth, pages, solvers
 from experiments.datasets.splits import on_side
@@ -92,7 +92,7 @@ class Memory:
                 save_json(run.out / "rows.json", rows)
                 bar.advance(f"{size} × {size}: {mib:.0f} MiB")
         show_table(rows)
-        run.finish({"rows": rows, **origin()})
+        run.finish({"rows": rows})
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class Gradients:
         show(facts)
         show(timing)
         evaluations = sum(subject.sdf.evaluations for subject in subjects)
-        run.finish({"rows": facts, "timing": timing, **origin(), "evaluations": evaluations})
+        run.finish({"rows": facts, "timing": timing, "evaluations": evaluations})
 
 
 @dataclass(frozen=True)
@@ -148,7 +148,7 @@ class BoundaryGradients:
                 rows.append(asdict(row))
                 bar.advance(f"{row.field} by {row.parameter}, {row.method}")
         show_table(rows)
-        run.finish({"rows": rows, **origin()})
+        run.finish({"rows": rows})
 
 
 @dataclass(frozen=True)
@@ -174,4 +174,4 @@ class Solvers:
         show(rows)
         curves = [{"seconds": curve.seconds, "losses": curve.losses} for _, curve in measured]
         evaluations = sum(row["evaluations"] for row in rows)
-        run.finish({"rows": rows, "curves": curves, **origin(), "evaluations": evaluations})
+        run.finish({"rows": rows, "curves": curves, "evaluations": evaluations})

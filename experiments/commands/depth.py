@@ -9,7 +9,7 @@ from statistics import median
 import tyro
 
 from distrace.cli.common import show_table
-from distrace.cli.console import console, origin, progress, start
+from distrace.cli.console import console, progress, start
 from distrace.files import save_text
 from distrace.processes import parallel_map
 from experiments.datasets.splits import CLASSES, Meshes
@@ -69,7 +69,7 @@ class _DepthTable:
             "instances": [each.row() for each in results],
             "evaluations": sum(each.evaluations for each in results),
         }
-        run.finish({**facts, **extra(place, trials), **origin()})
+        run.finish({**facts, **extra(place, trials)})
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ class Spread:
         show_table(rows)
         medians = {c: median(row["correlation"] for row in rows if row["category"] == c) for c in self.classes}
         console.print("median rank correlation: " + ", ".join(f"{name} {value:.2f}" for name, value in medians.items()))
-        run.finish({"rows": rows, "median_correlation": medians, **origin()})
+        run.finish({"rows": rows, "median_correlation": medians})
 
 
 @dataclass(frozen=True)
@@ -178,7 +178,7 @@ class Multiview:
             save_clip_page(run.out / "pages", clip, of_clip, self.meshes)
         rows = multiview_rows(results)
         show_table(rows)
-        run.finish({"rows": rows, "instances": [each.row() for each in results], **origin()})
+        run.finish({"rows": rows, "instances": [each.row() for each in results]})
 
 
 def checked(jobs: int, shapes: int | None, views: int = 1) -> None:

@@ -14,10 +14,11 @@ import tyro
 from PIL import Image, ImageDraw
 
 import distrace as dt
+from distrace.antialiasing import clay_picture
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, start
+from distrace.cli.console import start
 from distrace.fields.primitives import box, intersection
-from distrace.shading import Picture, save_png, shaded_picture, side_by_side
+from distrace.shading import Picture, save_png, side_by_side
 
 CAUTIOUS = dt.TraceConfig(steps=200, step_scale=1.0, coarse_levels=0)  # gradients reach 2.2: longer steps diverge
 SIZE = 128  # pixels
@@ -38,7 +39,7 @@ class ForeignModels:
             save_png(run.out / "foreign-models.png", side_by_side(pictures))
         show_table(rows)
         evaluations = sum(int(row.get("evaluations", 0)) for row in rows)
-        run.finish({"rows": rows, **origin(), "evaluations": evaluations})
+        run.finish({"rows": rows, "evaluations": evaluations})
 
 
 def tiled(model: dt.Model, tiles: int) -> dt.SDF:
@@ -62,7 +63,7 @@ def _row(folder: Path, pictures: list[Picture]) -> dict[str, str | int]:
     field = intersection(tiled(model, tiling[0]) if tiling else model.field(0), box(torch.ones(3)))
     camera = dt.Camera.orbit(30, 20, 6.8, height=SIZE, width=SIZE)
     buffers = dt.render(field, camera, radius=3**0.5, config=CAUTIOUS)
-    picture = Image.fromarray(shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions))
+    picture = Image.fromarray(clay_picture(buffers))
     ImageDraw.Draw(picture).text(
         (SIZE / 2, SIZE - 1), folder.name.removeprefix("test_experiment_"), "black", anchor="ms"
     )

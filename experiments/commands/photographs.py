@@ -6,7 +6,7 @@ from pathlib import Path
 import tyro
 
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, start
+from distrace.cli.console import start
 from distrace.cli.reconstruct import Reconstruct
 from experiments.tables.trials import read_json
 
@@ -41,7 +41,7 @@ class Photographs:
                 rows += result["rows"]
                 evaluations += result["evaluations"]
         show_table(rows)
-        run.finish({"rows": rows, "evaluations": evaluations, **origin()})
+        run.finish({"rows": rows, "evaluations": evaluations})
 
     def _result(self, folder: Path, method: str) -> dict:
         """Runs `reconstruct` in a folder of its own, and returns its `result.json`."""

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, progress, start
+from distrace.cli.console import progress, start
 from distrace.processes import parallel_map
 from experiments.commands.depth import checked, paired
 from experiments.datasets.splits import CLASSES, Meshes
@@ -46,7 +46,7 @@ class Placement:
         show_table(rows)
         show_table(verdicts)
         facts = {"rows": rows, "verdicts": verdicts, "instances": [each.row() for each in results]}
-        run.finish({**facts, "evaluations": sum(each.evaluations for each in results), **origin()})
+        run.finish({**facts, "evaluations": sum(each.evaluations for each in results)})
 
     def _results(self, place: Place, trials: Sequence):
         """Returns the results; of one job in this process, with all of its threads."""

@@ -7,7 +7,7 @@ from typing import Literal
 import tyro
 
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, progress, start
+from distrace.cli.console import progress, start
 from distrace.fitting.placement_network import PLACEMENT_FILE, save_placement_network
 from experiments.datasets.splits import Meshes, on_side
 from experiments.networks.scans import ScanMaker, TrainingScans, joined_scans
@@ -39,7 +39,7 @@ class TrainPlacement:
         save_placement_network(run.out / PLACEMENT_FILE, network)
         row = {"class": self.category, "scans": self.scans, **validated(network, scans)}
         show_table([row])
-        run.finish({"rows": [row], **origin()})
+        run.finish({"rows": [row]})
 
     def _scans(self, path: Path) -> TrainingScans:
         parts = [TrainingScans.load(path)] if path.is_file() else []

@@ -10,7 +10,7 @@ import tyro
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
 from distrace.cli.common import show_table
-from distrace.cli.console import origin, progress, start
+from distrace.cli.console import progress, start
 from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.placement_network import load_placement_network
@@ -57,7 +57,7 @@ class RealScans:
         names = [each.name for each in given]
         rows.sort(key=lambda row: names.index(row["input"]))
         show_table(rows)
-        run.finish({"rows": rows, "evaluations": sum(row["evaluations"] for row in rows), **origin()})
+        run.finish({"rows": rows, "evaluations": sum(row["evaluations"] for row in rows)})
 
 
 def completed(out: Path, resolution: int, seed: int, given: Input) -> dict:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from distrace import shading
 from distrace.cli.common import ModelName, opened, show_table
-from distrace.cli.console import Run, console, origin, progress, start
+from distrace.cli.console import Run, console, progress, start
 from distrace.files import save_json, save_text
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.processes import parallel_map
@@ -100,7 +100,7 @@ class Pose:
         rows = pose_table.rows_of(self.model, finished)
         show_table([{SHORT.get(key, key): value for key, value in row.items() if key != "model"} for row in rows])
         save_text(run.out / "index.html", pose_table.pose_page(self.model, rows))
-        run.finish({"rows": rows, **origin(), "evaluations": sum(found.evaluations for found in finished)})
+        run.finish({"rows": rows, "evaluations": sum(found.evaluations for found in finished)})
 
 
 def _collect(run: Run, name: str, model: str, results: Iterable[Result], count: int) -> None:
@@ -131,4 +131,4 @@ def _save(run: Run, name: str, model: str, results: list[Result]) -> None:
         section("Shapes", figure(sheet, "true surface, then each method")),
     ]
     save_text(run.out / "index.html", page(f"{name}: {model}", lead, parts))
-    run.finish({"rows": rows, "summary": totals, **origin()})
+    run.finish({"rows": rows, "summary": totals})

@@ -4,7 +4,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from distrace.cli.common import ModelName, opened, show_table
-from distrace.cli.console import console, origin, progress, start
+from distrace.cli.console import console, progress, start
 from distrace.files import save_json, save_text
 from distrace.shading import save_png
 from experiments.datasets.splits import CLASSES, Meshes, read_split
@@ -30,7 +30,7 @@ class Splits:
                 nearest = nearest_rows(shapes, self.meshes, bar.advance)
             rows += [{"class": split, **asdict(row)} for row in nearest]
         show_table(rows)
-        run.finish({"rows": rows, **origin()})
+        run.finish({"rows": rows})
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class Choices:
                 save_json(run.out / "rows.json", rows)
                 bar.advance(f"{row.choice}: {row.held_out_median:.2f}")
         show_table(rows)
-        run.finish({"rows": rows, **origin()})
+        run.finish({"rows": rows})
 
 
 @dataclass(frozen=True)
@@ -75,4 +75,4 @@ class Card:
         save_png(run.out / "shapes.png", pairs_picture(model, shapes, self.meshes))
         save_text(run.out / "shapes.md", shapes_table(shapes))
         console.print(f"{len(model.codes)} codes of {len(shapes)} shapes")
-        run.finish({"codes": len(model.codes), **origin()})
+        run.finish({"codes": len(model.codes)})

@@ -11,7 +11,7 @@ import torch
 import tyro
 
 from distrace.benchmarks.agreement import Reference
-from distrace.benchmarks.random_views import View
+from distrace.benchmarks.random_views import RandomView
 from distrace.checkpoints.model import Model, load_model
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.console import start
@@ -29,11 +29,11 @@ class FieldPlan(Plan):
 
     references: Path | None = None  # their folder
 
-    def draw(self, models: Sequence[Model]) -> Iterator[View]:
+    def draw(self, models: Sequence[Model]) -> Iterator[RandomView]:
         yield from super().draw(models)
         yield from analytic_views(load_model(DISTORTED).field(0), self.per_family, self.sizes, self.seed)
 
-    def reference(self, view: View) -> Reference:
+    def reference(self, view: RandomView) -> Reference:
         """Reads the reference of a view, or computes and keeps it. Raises `ValueError` for a file that holds none."""
         path = self.references and self.references / f"{_digest(view)}.npz"
         if path and path.exists():
@@ -70,7 +70,7 @@ class Views:
         bench_views(start(self.out), plan)
 
 
-def _digest(view: View) -> str:
+def _digest(view: RandomView) -> str:
     """Returns a hash of the camera, and of the field's values at 64 points."""
     points = torch.from_numpy(np.random.default_rng(0).uniform(-1, 1, (64, 3))).float().to(view.device)
     with torch.no_grad():

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checking.differences import Images, derivatives, differences
+from distrace.checking.differences import Images, differences, image_derivatives
 from distrace.checking.gradcheck import Compared, compare
 from distrace.checking.moves import Change, Move, counted_moves, decoder_changes
 from distrace.checking.retrace import DOUBLE, Retraced
@@ -99,7 +99,7 @@ def ratio_rows(subject: Subject) -> Iterator[tuple[RatioRow, Float[Tensor, "heig
         central, kinks = differences(lambda h, move=move: view.retraced_hits(*move(h)), values, DOUBLE.step, like)
         kink = kinks["depth"].masked_fill(marched.distance[hit].isinf(), torch.nan)
         for method, images in methods.items():
-            slopes = derivatives(lambda h, move=move, images=images: images(*move(h)), like)
+            slopes = image_derivatives(lambda h, move=move, images=images: images(*move(h)), like)
             compared = compare(parameter, slopes["depth"], central["depth"], kink, DOUBLE)
             ratio = _ratio(compared)
             row = _ratio_row((subject.field, parameter, method), compared.error, ratio[~ratio.isnan()])

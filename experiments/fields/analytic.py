@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from distrace.benchmarks.random_views import SENSOR_MM, Shot, View, aimed, draw_shot
+from distrace.benchmarks.random_views import SENSOR_MM, RandomView, Shot, aim_at_surface, draw_shot
 from distrace.camera import Camera
 from distrace.fields import primitives
 from distrace.fields.base import SDF, placed
@@ -58,13 +58,13 @@ def hard_fields(decoder: SDF, camera: Camera) -> Mapping[str, HardField]:
     }
 
 
-def analytic_views(decoder: SDF, count: int, sizes: tuple[int, int], seed: int) -> Iterator[View]:
+def analytic_views(decoder: SDF, count: int, sizes: tuple[int, int], seed: int) -> Iterator[RandomView]:
     """Draws `count` views of each family; `decoder` is a trained field for the families that distort one."""
     for name, family in families(decoder).items():
         random = np.random.default_rng(seed)
         for _ in range(count):
             drawn = family(random, draw_shot(random, sizes))
-            yield View(name, None, drawn.sdf, drawn.shot, drawn.lipschitz)
+            yield RandomView(name, None, drawn.sdf, drawn.shot, drawn.lipschitz)
 
 
 def families(decoder: SDF) -> Mapping[str, Family]:
@@ -105,14 +105,14 @@ def _waves(like: Tensor) -> SDF:
 
 def _saturated(k: float, random: np.random.Generator, shot: Shot) -> Drawn:
     solid = table()
-    return Drawn(lambda points: torch.tanh(k * solid(points)), aimed(shot, solid, random), k)
+    return Drawn(lambda points: torch.tanh(k * solid(points)), aim_at_surface(shot, solid, random), k)
 
 
 def _hard(decoder: SDF, name: str, random: np.random.Generator, shot: Shot) -> Drawn:
     if name in OF_DECODER:
         shot = replace(shot, size=max(1, shot.size // 2))  # the reference takes longest on these families
     hard = hard_fields(decoder, shot.camera())[name]
-    return Drawn(hard.sdf, aimed(shot, hard.sdf, random), hard.lipschitz)
+    return Drawn(hard.sdf, aim_at_surface(shot, hard.sdf, random), hard.lipschitz)
 
 
 def _thin(make: Callable[[float], SDF], pixels: int, through: bool, random: np.random.Generator, shot: Shot) -> Drawn:
@@ -122,7 +122,7 @@ def _thin(make: Callable[[float], SDF], pixels: int, through: bool, random: np.r
     pose[:3, :3] = _rotation(random, _across(random, shot.eye() - middle) if through else None)
     pose[:3, 3] = middle
     sdf = placed(make(min(pixels * shot.pixel(middle), THICKEST)), pose)
-    return Drawn(sdf, aimed(shot, sdf, random))
+    return Drawn(sdf, aim_at_surface(shot, sdf, random))
 
 
 def _rod(width: float) -> SDF:
@@ -164,7 +164,7 @@ def _tiny(make: Callable[[float], SDF], random: np.random.Generator, shot: Shot)
 def _in_unit_sphere(random: np.random.Generator, shot: Shot) -> Drawn:
     """Draws a camera in front of a table, or among its legs."""
     solid = table()
-    return Drawn(solid, aimed(replace(shot, distance=float(random.uniform(0.05, 0.95))), solid, random))
+    return Drawn(solid, aim_at_surface(replace(shot, distance=float(random.uniform(0.05, 0.95))), solid, random))
 
 
 def _in_solid(random: np.random.Generator, shot: Shot) -> Drawn:

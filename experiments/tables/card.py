@@ -8,11 +8,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.antialiasing import clay_picture
 from distrace.benchmarks.measuring import poster_view
 from distrace.checkpoints.model import Model
 from distrace.data.shapes import Shape
 from distrace.render import render
-from distrace.report.completion_page import View
 from distrace.shading import Picture, grid, side_by_side
 from experiments.datasets.pictured import pictured
 from experiments.datasets.solids import solid_of
@@ -50,7 +50,7 @@ def walk(model: Model, first: int, last: int) -> list[Float[Tensor, "length"]]:
 
 def _shaded(model: Model, code: Float[Tensor, "length"]) -> Picture:
     with torch.no_grad():
-        return View.of(render(model.field(code), poster_view(TILE))).shaded
+        return clay_picture(render(model.field(code), poster_view(TILE)))
 
 
 def shapes_table(shapes: Sequence[Shape]) -> str:

@@ -25,8 +25,8 @@ def observation_of(view: View, method: str) -> View | Cloud:
         raise ValueError(f"there is no method {method!r}; give some of {', '.join(METHODS + CLOUDS)}")
     if method in ("ours", "ours+mask"):
         return view.without("normal") if method == "ours+mask" else view.without("normal", "mask")
-    cloud = Cloud(view.points(), None if view.normal is None else view.normal[view.seen])
-    return cloud.without("normal") if method == "points" else cloud
+    normals = None if view.normal is None or method == "points" else view.normal[view.seen]
+    return Cloud(view.points(), normals)
 
 
 def completed_by(method: str, model: Model, seen: View | Cloud, config: FitConfig | CodeFitConfig) -> CodeFit:

@@ -11,7 +11,7 @@ from distrace.checkpoints.model import Model
 from distrace.fields.decoder import NetworkSpecs
 from distrace.training.batches import load_samples
 from distrace.training.config import TrainConfig
-from distrace.training.trainer import faster_in_bfloat16, start, train
+from distrace.training.trainer import faster_in_bfloat16, start_training, train
 from experiments.datasets.splits import on_side
 from experiments.tables.completion import held_out_results, training_results
 
@@ -97,7 +97,7 @@ def choice_rows(
 
 def _trained(paths: list[Path], config: TrainConfig) -> Model:
     loaded = load_samples(paths)
-    training = start(len(paths), SPECS, config, CPU)
+    training = start_training(len(paths), SPECS, config, CPU)
     for _ in train(loaded, training, config):
         pass
     training.decoder.eval().requires_grad_(False)

@@ -39,8 +39,7 @@ class Style:
         shaded: list[np.ndarray] = []
         masks: list[np.ndarray] = []
         for part in parts:
-            colours = shaded_picture(part.normal, part.mask, part.rays.directions, light)
-            shaded.append(mean_light(colours, part.mask, self.samples, self.background))
+            shaded.append(mean_light(clay_picture(part, light), part.mask, self.samples, self.background))
             masks.append(mean_light(mask_picture(part.mask), part.mask, self.samples, WHITE))
         return np.concatenate(shaded), np.concatenate(masks)
 
@@ -50,6 +49,11 @@ class Style:
             yield render(sdf, band.resized(float(self.samples)), config=config, occupancy=buffers.occupancy)
 
 
+def clay_picture(buffers: Buffers, light: Float[np.ndarray, "3"] | None = None) -> Picture:
+    """Returns the shaded picture of what a camera sees, as `shaded_picture` does, with one ray a pixel."""
+    return shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions, light)
+
+
 @torch.no_grad()
 def smooth_outline(buffers: Buffers, camera: Camera) -> Picture:
     """Returns the shaded picture with four rays in each pixel at the outline, and one in all others.
@@ -57,7 +61,7 @@ def smooth_outline(buffers: Buffers, camera: Camera) -> Picture:
     It costs less than an image of twice the size; edges within the outline stay as they are.
     """
     light = key_light(buffers.rays.directions)
-    picture = shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions, light)
+    picture = clay_picture(buffers, light)
     inner = buffers.mask.float()[None]
     grown = max_pool2d(inner, 3, 1, 1)[0] > 0
     shrunk = -max_pool2d(-inner, 3, 1, 1)[0] > 0

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
+import safetensors.torch
+import torch
 from torch import Tensor
 
 
@@ -62,6 +64,15 @@ def save_arrays(path: str | Path, arrays: Mapping[str, Tensor], words: Mapping[s
     content |= {name: np.array(word) for name, word in words.items()}
     with atomic_write(path) as file:
         np.savez_compressed(file, **content)
+
+
+def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], dtype: torch.dtype = torch.float16) -> None:
+    """Writes tensors as safetensors; those of floating-point numbers in half precision, or another type."""
+    content: dict[str, Tensor] = {}
+    for name, tensor in tensors.items():
+        content[name] = (tensor.detach().to(dtype) if tensor.is_floating_point() else tensor).contiguous()
+    with atomic_write(path) as file:
+        file.write(safetensors.torch.save(content))
 
 
 def _remove_stale_parts(path: Path) -> None:

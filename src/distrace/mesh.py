@@ -94,9 +94,10 @@ def mesh_in_world(mesh: "trimesh.Trimesh", place: Similarity) -> "trimesh.Trimes
 
 
 def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
-    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the sRGB colours of its vertices.
+    """Writes a mesh in the format of the name, PLY, GLB or OBJ, with the colours of its vertices.
 
-    A GLB holds the same colours in linear light, as glTF 2.0 has them (section 3.7.2.1).
+    The mesh has sRGB colours of 8 bits a channel. PLY holds them as they are, OBJ as fractions of one, and GLB in
+    linear light of 8 bits, as glTF 2.0 has them (section 3.7.2.1): of dark colours it keeps fewer levels.
     """
     from trimesh.visual import ColorVisuals
 

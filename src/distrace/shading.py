@@ -122,7 +122,7 @@ def error_picture(difference: Float[Array, "height width"], limit: float) -> Pic
     return _over_white(_mapped("coolwarm", np.where(finite, values, 0) / (2 * limit) + 0.5), finite)
 
 
-def difference(depth: Float[Array, "height width"], truth: Float[Array, "height width"]) -> np.ndarray:
+def depth_difference(depth: Float[Array, "height width"], truth: Float[Array, "height width"]) -> np.ndarray:
     """Depth − truth; NaN where one of them is not finite."""
     first = _numpy(depth)
     second = _numpy(truth)

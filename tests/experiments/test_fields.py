@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from distrace.benchmarks.measuring import poster_view, reference_depth, reference_distance
-from distrace.benchmarks.random_views import Shot, View
+from distrace.benchmarks.random_views import RandomView, Shot
 from distrace.fields.primitives import box, sphere, union
 from distrace.rays import Rays, meet_sphere
 from distrace.render import render
@@ -79,11 +79,11 @@ def test_the_page_tells_what_went_unnoticed(rows: list[FieldRow]) -> None:
 
 
 @pytest.fixture(scope="module")
-def drawn() -> list[View]:
+def drawn() -> list[RandomView]:
     return list(analytic.analytic_views(sphere(0.6), 2, (32, 48), 0))
 
 
-def test_every_family_is_drawn_and_no_field_is_steeper_than_its_lipschitz_constant(drawn: list[View]) -> None:
+def test_every_family_is_drawn_and_no_field_is_steeper_than_its_lipschitz_constant(drawn: list[RandomView]) -> None:
     assert [view.model for view in drawn] == [name for name in analytic.NAMES for _ in range(2)]
     for view in drawn:
         points = (torch.tensor(view.shot.target) + 0.3 * torch.randn(500, 3)).requires_grad_()
@@ -92,7 +92,7 @@ def test_every_family_is_drawn_and_no_field_is_steeper_than_its_lipschitz_consta
 
 
 @pytest.mark.slow
-def test_every_family_but_the_camera_in_the_solid_is_seen(drawn: list[View]) -> None:
+def test_every_family_but_the_camera_in_the_solid_is_seen(drawn: list[RandomView]) -> None:
     for view in drawn:
         truth = reference_depth(lambda points, view=view: view.sdf(points) / view.lipschitz, view.camera())
         seen = int(torch.isfinite(truth).sum())

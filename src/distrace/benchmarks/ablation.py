@@ -10,6 +10,7 @@ from torch import Tensor
 from distrace.benchmarks.measuring import Case, reference_depth
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
+from distrace.data.points import random_subset
 from distrace.fields.base import SDF, chunked
 from distrace.rays import Bounds, meet_sphere
 from distrace.render import STRATEGIES, Buffers, render
@@ -46,7 +47,7 @@ def _naive(sdf: SDF, camera: Camera, truth: Tensor) -> Case:
     rays = camera.rays().flat()
     bounds = meet_sphere(rays)
     entering = bounds.meets.nonzero()[:, 0]
-    sample = entering[torch.randperm(len(entering), generator=torch.Generator().manual_seed(0))[:NAIVE_RAYS]]
+    sample = random_subset(entering, NAIVE_RAYS)
     cosines = camera.cosines().reshape(-1)[sample]
 
     def trace_one(k: Tensor) -> Trace:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.benchmarks.measuring import OUTLIER, reference_depth, timed
-from distrace.benchmarks.random_views import Mixture, Shot, View
+from distrace.benchmarks.random_views import Mixture, RandomView, Shot
 from distrace.metrics import depth_errors, iou
 from distrace.render import Buffers, Config, render
 from distrace.tracing.sphere_tracing import Outcome
@@ -60,7 +60,7 @@ class Measured:
     """A row, and the two images that it compares."""
 
     row: ViewRow
-    view: View
+    view: RandomView
     buffers: Buffers
     truth: Float[Tensor, "size size"]  # depth by the reference
 
@@ -81,7 +81,7 @@ class Summary:
     bar: str  # "met", or the bars that fail
 
 
-def reference_of(view: View) -> Reference:
+def reference_of(view: RandomView) -> Reference:
     """Computes the reference of a view."""
     start = time.perf_counter()
     depth = reference_depth(lambda points: view.sdf(points) / view.lipschitz, view.camera())
@@ -89,10 +89,10 @@ def reference_of(view: View) -> Reference:
 
 
 def measure_view(
-    view: View,
+    view: RandomView,
     strategy: str = "default",
     config: Config | None = None,
-    reference: Callable[[View], Reference] = reference_of,
+    reference: Callable[[RandomView], Reference] = reference_of,
 ) -> Measured:
     """Renders a view by a configuration, or by the default of `render`, and compares it with the reference."""
     options: dict[str, Any] = {} if config is None else {"config": config}
@@ -122,7 +122,12 @@ def badness(measured: Measured) -> tuple[bool, float, int]:
 
 
 def _row(
-    view: View, strategy: str, buffers: Buffers, truth: Float[Tensor, "h w"], seconds: float, reference_seconds: float
+    view: RandomView,
+    strategy: str,
+    buffers: Buffers,
+    truth: Float[Tensor, "h w"],
+    seconds: float,
+    reference_seconds: float,
 ) -> ViewRow:
     trace = buffers.trace
     visible = torch.isfinite(truth)

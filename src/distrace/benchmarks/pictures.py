@@ -5,9 +5,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from distrace import shading, surface
+from distrace.antialiasing import clay_picture
 from distrace.benchmarks.agreement import Measured
 from distrace.render import Buffers
-from distrace.report.completion_page import View as Rendered
 from distrace.shading import Picture
 
 MAPPED = ("coarse_to_fine", "fast", "fast_next")
@@ -34,11 +34,10 @@ def pictures_of(measured: Measured) -> list[Picture]:
     normal = torch.zeros_like(rays.directions)
     with torch.no_grad():
         normal[visible] = surface.normals(measured.view.sdf, rays[visible].at(distance[visible]))
-        rendered = Rendered.of(buffers).shaded
     reference = shading.shaded_picture(normal, visible, rays.directions)
     crop = _crop(visible | buffers.mask)
     times = max(1, SIDE // max(visible[crop].shape))
-    pictures = (reference, rendered, shading.mask_comparison(visible, buffers.mask))
+    pictures = (reference, clay_picture(buffers), shading.mask_comparison(visible, buffers.mask))
     return [picture[crop].repeat(times, 0).repeat(times, 1) for picture in pictures]
 
 

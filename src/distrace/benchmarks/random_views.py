@@ -58,7 +58,7 @@ class Mixture:
 
 
 @dataclass(frozen=True)
-class View:
+class RandomView:
     """A field and a camera. The reference divides the field by its Lipschitz constant."""
 
     model: str
@@ -72,7 +72,7 @@ class View:
         return self.shot.camera().to(self.device)
 
 
-def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> Iterator[View]:
+def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> Iterator[RandomView]:
     """Draws codes and cameras. Every third code lies between two training codes; a larger count appends views.
 
     Raises `ValueError` for sizes that no image has.
@@ -87,8 +87,8 @@ def model_views(model: Model, count: int, sizes: tuple[int, int], seed: int) -> 
         else:
             code = int(random.integers(len(codes)))
             field = model.field(code)
-        shot = aimed(draw_shot(random, sizes), field, random, codes.device)
-        yield View(model.name, code, field, shot, device=codes.device)
+        shot = aim_at_surface(draw_shot(random, sizes), field, random, codes.device)
+        yield RandomView(model.name, code, field, shot, device=codes.device)
 
 
 def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
@@ -111,7 +111,9 @@ def draw_shot(random: np.random.Generator, sizes: tuple[int, int]) -> Shot:
 
 
 @torch.no_grad()
-def aimed(shot: Shot, sdf: SDF, random: np.random.Generator, device: torch.device = torch.device("cpu")) -> Shot:
+def aim_at_surface(
+    shot: Shot, sdf: SDF, random: np.random.Generator, device: torch.device = torch.device("cpu")
+) -> Shot:
     """Returns the shot with its target at a random point near the surface, so that a long lens sees some of it."""
     points = torch.from_numpy(random.uniform(-0.6, 0.6, (CANDIDATES, 3))).float().to(device)
     point = points[sdf(points).abs().argmin()]

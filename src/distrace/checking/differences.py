@@ -8,7 +8,7 @@ from torch import Tensor
 Images = dict[str, Tensor]
 
 
-def derivatives(images: Callable[[Tensor], Images], like: Tensor) -> Images:
+def image_derivatives(images: Callable[[Tensor], Images], like: Tensor) -> Images:
     """Returns d images / dh at h = 0 for every pixel, by autograd; zero for an image that does not depend on h.
 
     `like` gives dtype and device of h. Two reverse passes make a forward pass: the product with a cotangent u is

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.checking.differences import Images, derivatives, differences
+from distrace.checking.differences import Images, differences, image_derivatives
 from distrace.checking.moves import Change, Move, counted_moves, in_double, own_changes
 from distrace.checking.retrace import DOUBLE, SINGLE, Footprints, Precision, Retraced
 from distrace.fields.base import SDF, Counted
@@ -141,7 +141,7 @@ def _accepts_double(sdf: SDF, like: Tensor) -> bool:
 def _compare_view(view: Retraced, values: Images, along: str, move: Move) -> dict[str, Compared]:
     """Returns the comparison of every quantity that has pixels."""
     like = values["distance"]
-    slopes = derivatives(lambda h: view.attached(*move(h)), like)
+    slopes = image_derivatives(lambda h: view.attached(*move(h)), like)
     central, kinks = differences(lambda h: view.retraced(*move(h)), values, view.precision.step, like)
     return {
         name: compare(along, slopes[name], central[name], kinks[name], view.precision)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from distrace import surface
 from distrace.camera import Camera
-from distrace.checking.differences import Images, derivatives, differences
+from distrace.checking.differences import Images, differences, image_derivatives
 from distrace.checking.moves import Move
 from distrace.fields.base import SDF, value_and_gradient
 from distrace.pixels import thinned
@@ -131,7 +131,7 @@ class Footprints:
             buffers = self._buffers(*move(h), self._distance)
             return {"footprint normal": buffers.footprint_normal, "hit points": buffers.points}
 
-        by_autograd = derivatives(attached, self._distance)
+        by_autograd = image_derivatives(attached, self._distance)
         speed = float(by_autograd["hit points"].norm(dim=-1).median())
         normals = {"footprint normal": by_autograd["footprint normal"]}  # for its shape: central differences ignore it
         h = step / speed if speed > 0 else step  # where nothing moves, any step will do

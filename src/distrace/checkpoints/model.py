@@ -23,7 +23,7 @@ from distrace.errors import error_context
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
 from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.files import atomic_write
+from distrace.files import save_json, save_tensors
 
 BUNDLED = Path(__file__).parents[1] / "models"
 VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
@@ -147,8 +147,7 @@ def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.floa
     for layer in range(model.decoder.depth):
         tensors[f"lin{layer}.weight"] = getattr(model.decoder, f"lin{layer}").weight
     _write_specs(folder, plain, model.shapes)
-    with atomic_write(folder / "model.safetensors") as file:
-        file.write(safetensors.torch.save({key: t.detach().to(dtype).contiguous() for key, t in tensors.items()}))
+    save_tensors(folder / "model.safetensors", tensors, dtype)
 
 
 def save_experiment(folder: str | Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
@@ -162,8 +161,7 @@ def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> 
     network = asdict(specs)
     length = network.pop("code_length")
     content = {"NetworkArch": "deep_sdf_decoder", "NetworkSpecs": network, "CodeLength": length, "Shapes": shapes}
-    with atomic_write(folder / "specs.json") as file:
-        file.write(json.dumps(content, indent=1).encode())
+    save_json(folder / "specs.json", content)
 
 
 def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:

@@ -58,7 +58,9 @@ COMMANDS: Commands = {
     "reconstruct": Lazy(
         "distrace.cli.reconstruct", "Reconstruct", "Reconstruct any object from photographs with known cameras."
     ),
-    "view": Lazy("distrace.cli.view", "View", "Show a shape in the browser: a model's, or what another command found."),
+    "view": Lazy(
+        "distrace.cli.view", "ViewShape", "Show a shape in the browser: a model's, or what another command found."
+    ),
     "data": Lazy("distrace.cli.data", "Data", "Fetch a source of meshes, and list each with its creator and licence."),
     "sample": Lazy("distrace.cli.data", "Sample", "Turn meshes into signed samples in DeepSDF's .npz."),
     "train": Lazy("distrace.cli.train", "Train", "Train a DeepSDF decoder and the codes of its shapes."),

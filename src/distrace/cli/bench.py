@@ -15,7 +15,7 @@ from distrace.checkpoints.codes import named_code
 from distrace.checkpoints.model import Model, bundled_models
 from distrace.cli.bench_views import Plan, bench_views
 from distrace.cli.common import CodeName, default, opened, show_table
-from distrace.cli.console import Run, origin, progress, start
+from distrace.cli.console import Run, progress, start
 from distrace.shading import save_png, side_by_side
 
 HIDDEN = ("model", "share", "runs")  # columns that the terminal does not show
@@ -100,7 +100,7 @@ class Bench:
             for row in found.rows
         ]
         show(rows)
-        run.finish({"rows": rows, **origin(), "evaluations": found.evaluations})
+        run.finish({"rows": rows, "evaluations": found.evaluations})
 
 
 def rows_of(model: str, measured: Iterable[Any]) -> list[dict[str, Any]]:
@@ -116,4 +116,4 @@ def finish(run: Run, rows: list[dict[str, Any]]) -> None:
     show(rows)
     evaluations = sum(row.get("queries", 0) for row in rows)
     setup_evaluations = sum(row.get("setup_queries", 0) for row in rows)
-    run.finish({"rows": rows, **origin(), "evaluations": evaluations, "setup_evaluations": setup_evaluations})
+    run.finish({"rows": rows, "evaluations": evaluations, "setup_evaluations": setup_evaluations})

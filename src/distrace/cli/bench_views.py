@@ -5,10 +5,10 @@ from dataclasses import asdict, dataclass
 
 from distrace.benchmarks.agreement import Measured, Reference, badness, measure_view, reference_of, summaries
 from distrace.benchmarks.pictures import pictures_of
-from distrace.benchmarks.random_views import View, model_views
+from distrace.benchmarks.random_views import RandomView, model_views
 from distrace.checkpoints.model import Model
 from distrace.cli.common import opened, show_table
-from distrace.cli.console import Run, origin, progress
+from distrace.cli.console import Run, progress
 from distrace.render import STRATEGIES
 from distrace.shading import grid, save_png
 
@@ -34,12 +34,12 @@ class Plan:
         if not 1 <= low <= high:
             raise ValueError(f"--sizes {low} {high} was given; give the smallest size first, at least 1 pixel")
 
-    def draw(self, models: Sequence[Model]) -> Iterator[View]:
+    def draw(self, models: Sequence[Model]) -> Iterator[RandomView]:
         """Draws all views, one by one."""
         for model in models:
             yield from model_views(model, self.views, self.sizes, self.seed)
 
-    def reference(self, view: View) -> Reference:
+    def reference(self, view: RandomView) -> Reference:
         """Computes the reference of a view."""
         return reference_of(view)
 
@@ -69,4 +69,4 @@ def bench_views(run: Run, plan: Plan) -> None:
     facts = {"strategy": strategy, "seed": plan.seed, "views": plan.views, "sizes": list(plan.sizes)}
     content = {"rows": [asdict(row) for row in rows], "summary": [asdict(line) for line in lines]}
     passed = sum(not row.fails for row in rows)
-    run.finish({**content, **facts, **origin(), **evaluations}, f"{passed} of {len(rows)} views pass")
+    run.finish({**content, **facts, **evaluations}, f"{passed} of {len(rows)} views pass")

@@ -15,6 +15,7 @@ from distrace.checkpoints.codes import model_source
 from distrace.checkpoints.model import Model, load_model
 from distrace.cli.console import Run, console
 from distrace.files import save_arrays
+from distrace.fitting.judge import Verdict
 from distrace.mesh import save_mesh
 from distrace.metrics import Chamfer
 from distrace.render import Buffers
@@ -141,10 +142,14 @@ def check_formats(formats: Sequence[Format]) -> None:
         raise ValueError("--format was given without a format; name ply, glb, obj, or several of them")
 
 
-def chamfer_facts(distances: Chamfer) -> tuple[dict[str, float], str]:
-    """Returns the distance to a true surface for `result.json`, and as a line."""
-    facts = {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
-    return facts, f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it"
+def finish_completion(run: Run, verdict: Verdict, loss: float, evaluations: int, distances: Chamfer | None) -> None:
+    """Writes `result.json` of a completion, and prints its verdict and its distances from a true surface."""
+    facts = {**verdict.facts(), "loss": loss, "evaluations": evaluations}
+    lines = [f"{verdict.name}: {verdict.reason}"]
+    if distances is not None:
+        facts |= {"chamfer_to": distances.to, "chamfer_from": distances.from_, "chamfer": distances.sum}
+        lines.append(f"Chamfer × 1000: {distances.to:.3f} to the true surface, {distances.from_:.3f} from it")
+    run.finish(facts, *lines)
 
 
 def show_table(rows: Sequence[Mapping[str, object]]) -> None:

@@ -84,10 +84,9 @@ class Complete:
             raise ValueError(f"--plausible {self.plausible} was given; it cannot be negative")
         if self.points is not None and self.points < 1:
             raise ValueError(f"--points {self.points} was given; at least 1 is needed")
-        if not self.inputs:
-            raise ValueError("no input was given; give a depth image, an observation or a cloud of points")
         mesh = MeshConfig(self.resolution, device=run.device)
-        frame = self.frame or ("canonical" if all(map(is_canonical, self.inputs)) else "input")
+        canonical = len(self.inputs) > 0 and all(map(is_canonical, self.inputs))
+        frame = self.frame or ("canonical" if canonical else "input")
         self._refuse(frame)
         with run.noticing():
             verdict = self._canonical(run, mesh) if frame == "canonical" else self._placed(run, mesh)
@@ -118,9 +117,9 @@ class Complete:
         return complete_scan(run, ScanTask(model, network, scan, truth, mesh, self.seed, self.formats))
 
     def _canonical(self, run: Run, mesh: MeshConfig) -> Verdict:
-        if len(self.inputs) > 1:
+        if len(self.inputs) != 1:
             raise ValueError(f"{len(self.inputs)} inputs were given; give one, or --frame input, which takes several")
-        path = next(iter(self.inputs))
+        path = self.inputs[0]
         cloud = path.suffix.lower() in CLOUDS
         if cloud and (self.solver == "adam" or self.ignore):
             raise ValueError(f"{path} is a cloud of points, which knows no --solver adam and no --ignore")

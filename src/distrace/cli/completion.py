@@ -9,11 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace import shading
-from distrace.benchmarks.measuring import poster_view
+from distrace.antialiasing import smooth_outline
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Format, chamfer_facts, save_meshes
+from distrace.cli.common import Format, Orbit, finish_completion, save_meshes
 from distrace.cli.console import Run, progress
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
@@ -57,7 +57,7 @@ class Task:
     @property
     def camera(self) -> Camera:
         """Returns the view's camera; clouds are shown from above and in front."""
-        return poster_view(CLOUD_SIZE) if isinstance(self.full, Cloud) else self.full.camera
+        return Orbit(size=CLOUD_SIZE).camera() if isinstance(self.full, Cloud) else self.full.camera
 
     def surface(self, code: Float[Tensor, "length"]) -> "trimesh.Trimesh":
         return pruned_mesh(self.model.field(code), self.known, self.mesh)
@@ -91,13 +91,7 @@ def complete(run: Run, task: Task) -> Verdict:
     shading.save_png(run.out / "shaded.png", content.after.shaded)
     with run.optional("report.html"):
         save_text(run.out / "report.html", report.completion_page(content))
-    facts = {"loss": fit.loss, "evaluations": outcome.evaluations} | content.verdict.facts()
-    lines = [f"{content.verdict.name}: {content.verdict.reason}"]
-    if outcome.chamfer:
-        distances, line = chamfer_facts(outcome.chamfer)
-        lines.append(line)
-        facts |= distances
-    run.finish(facts, *lines)
+    finish_completion(run, content.verdict, fit.loss, outcome.evaluations, outcome.chamfer)
     return content.verdict
 
 
@@ -124,7 +118,7 @@ def _page_content(task: Task, outcome: CompletionResult) -> report.Completion:
     with torch.no_grad():
         codes = (prior_of(task.model.codes).mean, code)
         camera = task.camera.to(task.mesh.device)
-        before, after = (report.View.of(render(task.model.field(code), camera), camera) for code in codes)
+        before, after = (report.RenderedView.of(render(task.model.field(code), camera), camera) for code in codes)
     points = task.known.points if isinstance(task.known, Cloud) else known.points()
     pruned = outcome.mesh.metadata.get(PRUNED_PIECES, 0)
     facts = {
@@ -172,13 +166,13 @@ def _other_pictures(task: Task, outcome: CompletionResult) -> list[list[shading.
         buffers = render(model.field(outcome.fit.code), eye)
         distance = torch.full_like(buffers.depth, torch.nan)
         distance[buffers.mask] = posterior_deviation(model, codes, buffers.points)
-        pictures = [report.View.of(render(model.field(code), eye), eye).shaded for code in codes]
+        pictures = [smooth_outline(render(model.field(code), eye), eye) for code in codes]
         rows.append([shading.error_picture(distance.cpu().numpy(), SPREAD), *pictures])
     return rows
 
 
-def _truth_view(full: View) -> report.View | None:
+def _truth_view(full: View) -> report.RenderedView | None:
     """Returns the whole observation, or None where a part of it is missing."""
     if full.mask is None or full.normal is None or full.shaded is None:
         return None
-    return report.View(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)
+    return report.RenderedView(full.depth.numpy(), full.normal.numpy(), full.mask.numpy(), full.shaded)

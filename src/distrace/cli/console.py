@@ -93,17 +93,22 @@ class Run:
 
     def finish(self, facts: dict[str, Any], *lines: str) -> None:
         """Writes `result.json`, then prints lines and the folder."""
-        common = {"seconds": round(time.perf_counter() - self.began, 3), "device": device_name(self.device)}
+        content: dict[str, Any] = {
+            "seconds": round(time.perf_counter() - self.began, 3),
+            "device": device_name(self.device),
+            "version": distrace.__version__,
+            "command": " ".join(sys.argv),
+            "machine": machine(),
+            "warnings": self.warnings,
+        }
         if "evaluations" in facts:
-            common["setup_evaluations"] = 0  # unless facts say otherwise
-        about = {"version": distrace.__version__, "command": " ".join(sys.argv), "warnings": self.warnings}
+            content["setup_evaluations"] = 0  # unless facts say otherwise
         if self.model is not None:
-            about["model"] = self.model
-        content = {**common, **about, **facts}
-        save_json(self.out / "result.json", content)
+            content["model"] = self.model
+        save_json(self.out / "result.json", content | facts)
         for line in lines:
             console.print(line)
-        console.print(f"wrote {self.out} in {common['seconds']:.1f} s", soft_wrap=True)
+        console.print(f"wrote {self.out} in {content['seconds']:.1f} s", soft_wrap=True)
 
 
 def start(out: Path, device: str = "cpu") -> Run:
@@ -175,13 +180,8 @@ class Bar:
 
 
 def machine() -> str:
-    """Returns the processor and PyTorch's version, for recorded tables."""
+    """Returns the processor and PyTorch's version."""
     cpu = Path("/proc/cpuinfo")
     lines = cpu.read_text().splitlines() if cpu.exists() else []
     name = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown processor")
     return f"{name}, {torch.get_num_threads()} threads, PyTorch {torch.__version__}"
-
-
-def origin() -> dict[str, str]:
-    """Returns the command line and the machine, for recorded tables."""
-    return {"command": " ".join(sys.argv), "machine": machine()}

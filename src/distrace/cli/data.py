@@ -8,9 +8,9 @@ from typing import Annotated, Literal
 import tyro
 
 from distrace.cli.common import Flag, default
-from distrace.cli.console import console, origin, progress, start
+from distrace.cli.console import console, progress, start
 from distrace.data import furniture, planes, sampling
-from distrace.data.debian import listed, summary
+from distrace.data.debian import catalogue_package, catalogue_summary
 from distrace.data.samples import Doubt
 from distrace.data.shapes import every_mesh, read_split
 from distrace.optional import require
@@ -34,8 +34,8 @@ class Data:
 
     def run(self) -> None:
         run = start(self.out or Path("out") / self.name)
-        meshes = listed(*SOURCES[self.name], run.out, self.source)
-        run.finish({"source": self.name, "meshes": len(meshes)}, summary(meshes))
+        meshes = catalogue_package(*SOURCES[self.name], run.out, self.source)
+        run.finish({"source": self.name, "meshes": len(meshes)}, catalogue_summary(meshes))
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Sample:
         reports = sampled(jobs, self.workers)
         rows = [asdict(report) for report in sorted(reports, key=lambda report: report.name)]
         usable = sum(report.usable for report in reports)
-        run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows, **origin()})
+        run.finish({"shapes": usable, "left_out": len(reports) - usable, "rows": rows})
 
 
 def sampled(jobs: list[sampling.Job], workers: int) -> list[Doubt]:

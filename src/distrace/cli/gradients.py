@@ -9,7 +9,7 @@ import tyro
 from distrace.checking.gradcheck import ROUGHLY, STRAY, GradientCheck, GradientRow, check_gradients
 from distrace.checkpoints.codes import named_code
 from distrace.cli.common import CodeName, ModelName, Orbit, opened, show_table
-from distrace.cli.console import origin, start
+from distrace.cli.console import start
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class CheckGradients(Orbit):
         tolerances = {"tolerance": found.precision.tolerance, "stray": STRAY, "footprint_tolerance": ROUGHLY}
         facts = {"agrees": found.agrees, "verdicts": found.verdicts(), **tolerances, "evaluations": found.evaluations}
         rows = [{"model": self.model, **asdict(row)} for row in found.rows]
-        run.finish({**facts, "rows": rows, **origin()}, _summary(found))
+        run.finish({**facts, "rows": rows}, _summary(found))
         if not found.agrees:
             sys.exit(1)
 

@@ -11,7 +11,7 @@ from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, Format, ModelName, Views, check_formats, opened_for, save_meshes
 from distrace.cli.console import console, progress, start
-from distrace.data.photo_readers.transforms import save_cameras
+from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
 from distrace.files import save_text
 from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world
@@ -78,15 +78,14 @@ class Multiview:
         save_gif(run.out / "forming.gif", forming(model, fit.steps, views[0].camera))
         with run.optional("report.html"):
             save_text(run.out / "report.html", views_page(model, views, fit.steps, agreed, mesh))
-        sources = [view.source for view in found.views if view.source is not None]
-        save_cameras(run.out / "transforms.json", {source.file: source.camera for source in sources})
+        save_transforms(run.out, {view.name: view.source for view in found.views if view.source is not None})
         run.finish(
             {
                 "loss": last.loss,
                 "terms": last.terms,
                 "start": last.start,
                 "T_unit_object": last.place.T_world_object.tolist(),
-                "unit_sphere": found.placement.described(),
+                "unit_sphere": found.unit_sphere.described(),
                 "doubtful": [view.name for view in agreed if view.is_outlier],
                 "evaluations": fit.evaluations,
                 "setup_evaluations": fit.setup_evaluations,
@@ -106,12 +105,12 @@ def _fitted(model: Model, views: Sequence[Photograph], config: PhotoConfig) -> P
 def _mesh(model: Model, step: PhotoStep, found: Photographs, config: MeshConfig) -> "trimesh.Trimesh":
     """Returns the mesh in the folder's world."""
     mesh_unit = mesh_in_world(extract_mesh(model.field(step.code), config), step.place)
-    return mesh_in_world(mesh_unit, found.placement.similarity)
+    return mesh_in_world(mesh_unit, found.unit_sphere.similarity)
 
 
 def _described(found: Photographs) -> str:
-    centre = ", ".join(f"{x:.4g}" for x in found.placement.centre.tolist())
-    return f"the unit sphere lies around ({centre}) with a radius of {found.placement.radius:.4g}"
+    centre = ", ".join(f"{x:.4g}" for x in found.unit_sphere.centre.tolist())
+    return f"the unit sphere lies around ({centre}) with a radius of {found.unit_sphere.radius:.4g}"
 
 
 def _doubt(view: ViewAgreement) -> str:

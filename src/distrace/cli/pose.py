@@ -9,9 +9,10 @@ import torch
 import tyro
 
 from distrace import shading
+from distrace.antialiasing import clay_picture
 from distrace.camera import Camera
 from distrace.checkpoints.codes import named_code, save_code
-from distrace.cli.common import NONE, CodeName, Flag, ModelName, check_distance, default, opened_for
+from distrace.cli.common import NONE, CodeName, Flag, ModelName, Orbit, check_distance, default, opened_for
 from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
 from distrace.fields.base import SDF
@@ -73,8 +74,8 @@ class Pose:
         """Returns the observation's pose, or that of the options."""
         check_distance(self.distance)
         if self.azimuth is not None:
-            elevation = 20.0 if self.elevation is None else self.elevation
-            distance = 4.97 if self.distance is None else self.distance
+            elevation = Orbit.elevation if self.elevation is None else self.elevation
+            distance = Orbit.distance if self.distance is None else self.distance
             focal_px = float(camera.intrinsics[0, 0])
             around = Camera.orbit(self.azimuth, elevation, distance, focal_px=focal_px)
             return around.T_world_camera.to(camera.T_world_camera)
@@ -112,5 +113,4 @@ def _filmstrip(field: SDF, observed: View, steps: list[CameraStep]) -> shading.P
     with torch.no_grad():
         views = [render(field, step.camera) for step in picked]
     compared = [shading.mask_comparison(mask, view.mask) for view in views]
-    shaded = [shading.shaded_picture(view.normal, view.mask, view.rays.directions) for view in views]
-    return shading.grid([compared, shaded])
+    return shading.grid([compared, list(map(clay_picture, views))])

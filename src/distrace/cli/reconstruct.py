@@ -25,7 +25,7 @@ from distrace.reconstruction.state import (
     load_reconstruction,
     save_reconstruction,
 )
-from distrace.report.reconstruction_page import judged
+from distrace.report.reconstruction_page import compared_view
 from distrace.shading import save_png
 from distrace.threads import flushed_denormals
 
@@ -74,7 +74,7 @@ class Reconstruct:
         fitted_to, held_out = parted(found.views, self.held_out)
         with run_lock(run.out):
             state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
-            found_shape = Reconstructed(self.views.name, state, self.config, found.placement, fitted_to, held_out)
+            found_shape = Reconstructed(self.views.name, state, self.config, found.unit_sphere, fitted_to, held_out)
             found_shape.save(run, resolved, self.format)
 
     @property
@@ -137,7 +137,7 @@ def fitted(
         for step in reconstruct(views, state, config, depths):
             bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.loss_history.items()), to=step)
             if step % due == 0:
-                small = judged(state, shown, PREVIEWED)
+                small = compared_view(state, shown, PREVIEWED)
                 save_png(run.out / "previews" / f"{step:07d}.png", small.picture)
             if saving.passed():
                 save_reconstruction(run.out, state, config, marks)

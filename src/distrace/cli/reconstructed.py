@@ -13,16 +13,16 @@ import torch
 from distrace.camera import Camera
 from distrace.cli.common import Format, save_meshes
 from distrace.cli.console import Run, device_name
-from distrace.data.photo_readers.transforms import save_cameras
+from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photograph import Photograph
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.files import save_text
 from distrace.mesh import MeshConfig, mesh_in_world
 from distrace.movie import save_gif
 from distrace.pose import exp_se3
 from distrace.reconstruction.cameras import interpolated_step, moved, pixel_shift, registered
 from distrace.reconstruction.state import ReconstructConfig, Reconstruction
-from distrace.report.reconstruction_page import Judged, coloured_mesh, judged, reconstruction_page, row_of
+from distrace.report.reconstruction_page import ComparedView, coloured_mesh, compared_view, reconstruction_page, row_of
 from distrace.shading import grid, save_png
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ class Reconstructed:
     name: str
     state: Reconstruction
     config: ReconstructConfig
-    placement: Placement
+    unit_sphere: UnitSphere
     fitted_to: Sequence[Photograph]
     held_out: Sequence[Photograph]
 
@@ -51,17 +51,21 @@ class Reconstructed:
         if held_out:
             save_png(run.out / "held_out.png", grid([[view.picture] for view in held_out]))
         _save_film(run.out)
-        save_meshes(run.out, mesh_in_world(mesh, self.placement.similarity), formats)
+        save_meshes(run.out, mesh_in_world(mesh, self.unit_sphere.similarity), formats)
         rows = self._rows(held_out)
-        files = [view.source.file for view in self.fitted_to if view.source is not None]
-        save_cameras(run.out / "transforms.json", dict(zip(files, self._refined_in_world, strict=True)))
+        refined = {
+            view.name: replace(view.source, camera=camera)
+            for view, camera in zip(self.fitted_to, self._refined_in_world, strict=True)
+            if view.source is not None
+        }
+        save_transforms(run.out, refined)
         run.finish(
             {
                 "rows": rows,
                 "held_out": {
                     view.name: {"psnr": view.psnr, "silhouette_iou": view.silhouette_iou} for view in held_out
                 },
-                "unit_sphere": self.placement.described(),
+                "unit_sphere": self.unit_sphere.described(),
                 "cameras": self._cameras(),
                 "steps": self.state.step,
                 "evaluations": self.state.evaluations,
@@ -76,13 +80,12 @@ class Reconstructed:
 
     @cached_property
     def _refined_in_world(self) -> list[Camera]:
-        """Returns the refined cameras in the folder's world, from the cameras of the folder in double."""
+        """Returns the refined cameras in the folder's world, in double where the views were read from files."""
         exact = [
-            replace(view, camera=self.placement.camera_to_unit(view.source.camera))
+            view if view.source is None else replace(view, camera=self.unit_sphere.camera_to_unit(view.source.camera))
             for view in self.fitted_to
-            if view.source is not None
         ]
-        return [self.placement.camera_to_world(view.camera) for view in self._moved(exact)]
+        return [self.unit_sphere.camera_to_world(view.camera) for view in self._moved(exact)]
 
     def _moved(self, views: Sequence[Photograph]) -> list[Photograph]:
         """Returns the views that were fitted to, each with its camera's motion."""
@@ -93,11 +96,11 @@ class Reconstructed:
         """Returns by how many pixels each camera moved."""
         return [pixel_shift(*each) for each in zip(self.fitted_to, self._refined, strict=True)]
 
-    def _judged(self, views: Sequence[Photograph]) -> list[Judged]:
+    def _judged(self, views: Sequence[Photograph]) -> list[ComparedView]:
         """Compares views with their renderings, in the size that was fitted last."""
-        return [judged(self.state, view, self.config.sizes[-1]) for view in views]
+        return [compared_view(self.state, view, self.config.sizes[-1]) for view in views]
 
-    def _rows(self, held_out: Sequence[Judged]) -> list[dict[str, object]]:
+    def _rows(self, held_out: Sequence[ComparedView]) -> list[dict[str, object]]:
         if not held_out:
             return []
         judgements = {
@@ -115,7 +118,7 @@ class Reconstructed:
         step = interpolated_step(steps, eyes, view.camera.T_world_camera[:3, 3])
         return moved(view, exp_se3(step[:3], step[3:]))
 
-    def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[Judged]) -> None:
+    def _save_page(self, run: Run, mesh: "trimesh.Trimesh", held_out: Sequence[ComparedView]) -> None:
         examples = self._judged(self._refined[:: -(-len(self._refined) // FITTED_SHOWN)])
         facts = {
             "views": f"{len(self.fitted_to)}, and {len(held_out)} held out",

@@ -9,7 +9,7 @@ from distrace import shading
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import Model
-from distrace.cli.common import Format, chamfer_facts, save_meshes
+from distrace.cli.common import Format, Orbit, finish_completion, save_meshes
 from distrace.cli.console import Run, console, progress
 from distrace.data.saved_scan import save_scan
 from distrace.data.scan import Scan
@@ -59,12 +59,6 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     save_meshes(run.out, mesh, task.formats)
     pictures = _pictures(task.scan, shape, place)
     shading.save_png(run.out / "shaded.png", next(iter(pictures.values())))
-    facts = {**fit.verdict.facts(), "loss": fit.loss, "evaluations": fit.evaluations}
-    lines = [f"{fit.verdict.name}: {fit.verdict.reason}"]
-    if task.truth is not None:
-        distances, line = chamfer_facts(chamfer(_in_object(mesh, place), _in_object(task.truth, place)))
-        lines.append(line)
-        facts |= distances
     with run.optional("report.html"):
         content = scan_page(
             verdict=fit.verdict,
@@ -79,7 +73,8 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
             origin=run.origin,
         )
         save_text(run.out / "report.html", content)
-    run.finish(facts, *lines)
+    distances = None if task.truth is None else chamfer(_in_object(mesh, place), _in_object(task.truth, place))
+    finish_completion(run, fit.verdict, fit.loss, fit.evaluations, distances)
     return fit.verdict
 
 
@@ -103,7 +98,7 @@ def _pictures(scan: Scan, mesh: "trimesh.Trimesh", place: Similarity) -> dict[st
         name = "the sensor" if len(scan.views) == 1 else f"sensor {number + 1}"
         cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, SIDE / max(view.depth.shape))).to("cpu"))
     for name, (azimuth, elevation) in VIEWS.items():
-        cameras[name] = Camera.orbit(azimuth, elevation, 4.97, height=SIDE, width=SIDE)
+        cameras[name] = Orbit(azimuth=azimuth, elevation=elevation, size=SIDE).camera()
     return {name: mesh_picture(mesh, camera) for name, camera in cameras.items()}
 
 

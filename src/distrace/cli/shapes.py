@@ -9,9 +9,8 @@ import torch
 import tyro
 
 from distrace.antialiasing import smooth_outline
-from distrace.camera import Camera
 from distrace.checkpoints.model import Model
-from distrace.cli.common import ModelName, opened_for
+from distrace.cli.common import ModelName, Orbit, opened_for
 from distrace.cli.console import console, progress, start
 from distrace.fields.base import Counted
 from distrace.render import render
@@ -21,7 +20,6 @@ SIDE = 96  # pixels of a thumbnail
 LABEL = 30  # pixels below it, for the number and the name
 LETTER = 10  # pixels
 COLUMNS = 12
-POSTER = (30.0, 20.0, 4.97)  # azimuth, elevation and distance, as `render` has them
 
 
 @dataclass(frozen=True)
@@ -54,7 +52,7 @@ class Shapes:
 @torch.no_grad()
 def _sheet(model: Model, count: int) -> tuple[Picture, int]:
     """Returns the pictures of the first shapes with their names, and the number of evaluations."""
-    camera = Camera.orbit(*POSTER, height=SIDE, width=SIDE).to(model.codes.device)
+    camera = Orbit(size=SIDE).camera().to(model.codes.device)
     pictures: list[Picture] = []
     evaluations = 0
     with progress("drawing", count) as bar:

@@ -105,8 +105,10 @@ class Render(Orbit):
             facts["sample_evaluations"] = finer.evaluations
         pixels = self.size * self.size * len(tallies)
         summary = f"{facts['outcomes']['hit']} of {pixels} pixels hit, {facts['evaluations']} evaluations"
-        frames = {} if self.orbit is None else _each(tallies)
-        run.finish({**facts, "strategy": self.strategy, **frames}, summary)
+        if self.orbit is not None:
+            facts["frames"] = len(tallies)
+            facts["evaluations_per_visible_pixel"] = [tally.per_visible_pixel for tally in tallies]
+        run.finish({**facts, "strategy": self.strategy}, summary)
 
     def _drawn(
         self, views: Iterator[Buffers], cameras: Sequence[Camera], style: Style, sdf: Counted
@@ -159,11 +161,6 @@ def _facts(tallies: list[Tally], evaluations: int) -> dict[str, Any]:
         "clearance_evaluations": evaluations - traced - outcomes["hit"],
         "outcomes": outcomes,
     }
-
-
-def _each(tallies: list[Tally]) -> dict[str, Any]:
-    """Returns what `result.json` adds for a movie: the cost of each frame."""
-    return {"frames": len(tallies), "evaluations_per_visible_pixel": [tally.per_visible_pixel for tally in tallies]}
 
 
 @dataclass(frozen=True)

@@ -9,16 +9,15 @@ from typing import Annotated, Any
 import torch
 import tyro
 
-from distrace.benchmarks.measuring import poster_view
+from distrace.antialiasing import clay_picture
 from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import NONE, Every, default, opened
+from distrace.cli.common import NONE, Every, Orbit, default, opened
 from distrace.cli.console import Run, console, progress, start
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
 from distrace.render import render
 from distrace.report.charts import plot_history
-from distrace.report.completion_page import View
 from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
@@ -26,8 +25,7 @@ from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
 from distrace.training.fine_tuning import Distillation, oversampled
 from distrace.training.losses import STEPS_PER_LOSS
-from distrace.training.trainer import Training, begin_with, faster_in_bfloat16
-from distrace.training.trainer import start as start_training
+from distrace.training.trainer import Training, begin_with, faster_in_bfloat16, start_training
 from distrace.training.trainer import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
@@ -229,8 +227,8 @@ def _save(
     model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
     save_experiment(run.out, model.decoder, model.codes, model.shapes)
     training.decoder.eval()
-    camera = poster_view(128).to(run.device)
+    camera = Orbit(size=128).camera().to(run.device)
     numbers = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
     with torch.no_grad():
-        pictures = [View.of(render(model.field(number), camera)).shaded for number in numbers]
+        pictures = [clay_picture(render(model.field(number), camera)) for number in numbers]
     save_png(run.out / "preview.png", side_by_side(pictures))

@@ -14,7 +14,7 @@ from distrace.viewer.results import open_scene
 
 
 @dataclass(frozen=True)
-class View:
+class ViewShape:
     """Show a shape in the browser: a model's, or what another command found.
 
     The shape is traced live while the camera moves. Ctrl-C ends the viewer. Only this machine can open the page.

@@ -12,8 +12,8 @@ from skimage.morphology import dilation, disk, erosion, opening, remove_small_ho
 from skimage.segmentation import watershed
 
 from distrace.data.photographs import Photographs
-from distrace.data.placement import Placement
 from distrace.data.space_carving import within_masks
+from distrace.data.unit_sphere import UnitSphere
 
 MAX_BACKGROUND_BRIGHTNESS = 0.15  # brightness that most pixels along the edges of the images stay below
 SAMPLED_PIXELS = 200_000  # pixels that tell the background's colours
@@ -113,8 +113,8 @@ def _largest(mask: np.ndarray) -> np.ndarray:
 def _placed_again(photographs: Photographs) -> Photographs:
     """In the sphere around what the masks allow."""
     views = photographs.views
-    before = photographs.placement
+    before = photographs.unit_sphere
     sphere = within_masks(*zip(*((view.camera, view.known_mask) for view in views if view.known_mask.any())))
     placed = tuple(replace(view, camera=sphere.camera_to_unit(view.camera)) for view in views)
-    there = Placement(before.to_world(sphere.centre), before.radius * sphere.radius)
-    return replace(photographs, views=placed, placement=there)
+    there = UnitSphere(before.to_world(sphere.centre), before.radius * sphere.radius)
+    return replace(photographs, views=placed, unit_sphere=there)

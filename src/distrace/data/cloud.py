@@ -1,7 +1,7 @@
 """Points of a surface, as a scanner gives them: no camera, perhaps normals."""
 
 import warnings
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from distrace.data.checks import MAX_MEDIAN_RADIUS
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View
 from distrace.data.pcd import load_pcd
+from distrace.data.points import random_subset
 from distrace.errors import DoubtfulResult, error_context
 
 
@@ -30,11 +31,8 @@ class Cloud:
 
     def sparse(self, count: int, seed: int = 0) -> "Cloud":
         """Returns at most `count` of the points, drawn at random."""
-        chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
+        chosen = random_subset(torch.arange(len(self.points)), count, seed)
         return Cloud(self.points[chosen], None if self.normals is None else self.normals[chosen])
-
-    def without(self, *parts: str) -> "Cloud":
-        return replace(self, normals=None) if "normal" in parts else self
 
     def seen_from(self, camera: Camera) -> View:
         """Returns the points as depths of the pixels that they fall into, the nearest of each; none hides another's."""

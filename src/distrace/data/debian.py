@@ -20,7 +20,7 @@ COLUMNS = ("category", "name", "creator", "licence", "debian_package", "path")
 
 
 @dataclass(frozen=True)
-class Mesh:
+class MeshEntry:
     category: str
     name: str
     creator: str
@@ -29,9 +29,9 @@ class Mesh:
     path: Path  # relative to the catalogue's folder
 
 
-def listed(
-    package: str, catalogue: Callable[[Path, Path], list[Mesh]], out: Path, deb: Path | None = None
-) -> list[Mesh]:
+def catalogue_package(
+    package: str, catalogue: Callable[[Path, Path], list[MeshEntry]], out: Path, deb: Path | None = None
+) -> list[MeshEntry]:
     """Returns the meshes of a package, unpacked under `out` and listed in out/shapes.csv; fetched if `deb` is None.
 
     Raises `ValueError` if `out` cannot be written, apt-get cannot fetch, or `deb` is not that package.
@@ -43,7 +43,7 @@ def listed(
     return meshes
 
 
-def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
+def write_catalogue(meshes: Sequence[MeshEntry], path: Path) -> None:
     """Writes the meshes as CSV in UTF-8, a row each. Raises `ValueError` if `path` cannot be written."""
     table = io.StringIO()
     writer = csv.writer(table, lineterminator="\n")
@@ -53,7 +53,7 @@ def write_catalogue(meshes: Sequence[Mesh], path: Path) -> None:
         save_text(path, table.getvalue())
 
 
-def summary(meshes: Sequence[Mesh]) -> str:
+def catalogue_summary(meshes: Sequence[MeshEntry]) -> str:
     """Returns the counts by category and licence."""
     categories = _counted(mesh.category for mesh in meshes)
     licences = _counted(mesh.licence for mesh in meshes)

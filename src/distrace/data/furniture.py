@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 from distrace.data.archive import unpack_zip
-from distrace.data.debian import Mesh, by_hand, unpacked
+from distrace.data.debian import MeshEntry, by_hand, unpacked
 
 PACKAGE = "sweethome3d-furniture"
 CATEGORIES = {
@@ -33,7 +33,7 @@ _AUTHORS = (re.compile(r'downloading ".*" by (.+)'), re.compile(r"<title>.* by (
 _HEADER_AUTHOR = re.compile(r"^# 3D models created by ([^,\r\n]+)", re.MULTILINE)
 
 
-def catalogue(deb: Path, folder: Path) -> list[Mesh]:
+def catalogue(deb: Path, folder: Path) -> list[MeshEntry]:
     """Returns every .obj model of the package's catalogues, unpacked under `folder`; a second call unpacks nothing.
 
     Models in other formats are left out. Raises `ValueError` if `deb` is missing, broken, or another package.
@@ -49,7 +49,7 @@ def _arrange(content: Path, home: Path) -> None:
         unpack_zip(archive, home / archive.stem)
 
 
-def _meshes(properties: Path, folder: Path) -> list[Mesh]:
+def _meshes(properties: Path, folder: Path) -> list[MeshEntry]:
     """Returns the meshes of one catalogue, which its Java properties file describes as `name#7=…`, `model#7=…`."""
     root = properties.parent
     text = re.sub(r"\\u([0-9a-fA-F]{4})", _character, properties.read_text(encoding="latin-1"))
@@ -65,7 +65,7 @@ def _meshes(properties: Path, folder: Path) -> list[Mesh]:
             name = model.get("name") or path.stem
             creator = model.get("creator") or _creator_beside(path) or (author[1].strip() if author else "unknown")
             category = _category(name, model.get("tags", ""))
-            found.append(Mesh(category, name, creator, licence, PACKAGE, path.relative_to(folder)))
+            found.append(MeshEntry(category, name, creator, licence, PACKAGE, path.relative_to(folder)))
     return found
 
 

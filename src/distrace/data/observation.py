@@ -13,6 +13,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.arrays import camera_of, depth_image, mask_image, normal_image, read_arrays
 from distrace.data.checks import check_mask, check_normals, check_place
+from distrace.data.points import random_subset
 from distrace.errors import about
 from distrace.files import save_arrays
 from distrace.shading import Picture, shaded_picture
@@ -69,8 +70,7 @@ class View:
 
     def sparse(self, count: int, seed: int = 0) -> "View":
         """The same view with only `count` of its depths, drawn at random."""
-        chosen = torch.randperm(int(self.seen.sum()), generator=torch.Generator().manual_seed(seed))[:count]
-        kept = self.seen.nonzero()[chosen]
+        kept = random_subset(self.seen.nonzero(), count, seed)
         depth = torch.full_like(self.depth, torch.inf)
         depth[kept[:, 0], kept[:, 1]] = self.depth[kept[:, 0], kept[:, 1]]
         return replace(self, depth=depth)

@@ -15,10 +15,11 @@ MIN_COVERED = 1e-3  # pixels: what a last row or column covers at least, where t
 
 @dataclass(frozen=True)
 class Source:
-    """What a photograph was read from: the file of its image, and the camera in the folder's world, in double."""
+    """What a photograph was read from: its files, and the camera in the folder's world, in double."""
 
-    file: Path
+    image: Path
     camera: Camera
+    mask: Path | None = None
 
 
 @dataclass(frozen=True)

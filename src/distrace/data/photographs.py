@@ -15,9 +15,9 @@ from distrace.data.photo_readers.frames import Frame, inside
 from distrace.data.photograph import Photograph as Photograph
 from distrace.data.photograph import Source
 from distrace.data.pictures import read_mask, read_picture
-from distrace.data.placement import Placement as Placement
-from distrace.data.placement import among_points, between_axes
 from distrace.data.space_carving import within_masks
+from distrace.data.unit_sphere import UnitSphere as UnitSphere
+from distrace.data.unit_sphere import among_points, between_axes
 from distrace.errors import about
 from distrace.files import save_json
 from distrace.pixels import thinned
@@ -39,7 +39,7 @@ class Photographs:
     """Views of one object in the unit sphere, and how that lies in the world of their folder."""
 
     views: tuple[Photograph, ...]
-    placement: Placement
+    unit_sphere: UnitSphere
     layout: str
     sphere_known: bool = False  # whether the folder says where the unit sphere lies
 
@@ -62,13 +62,13 @@ def load_photographs(folder: Path) -> Photographs:
     with about(folder):
         if len(masks) == len(views) and not any(mask.any() for mask in masks):
             raise ValueError(f"its {len(masks)} masks mark no pixel as object; they are white where the object is")
-        placement = frames.placement or estimated(views, frames.points)
+        unit_sphere = frames.unit_sphere or estimated(views, frames.points)
     placed = []
     for view in views:
-        camera = placement.camera_to_unit(view.camera)
+        camera = unit_sphere.camera_to_unit(view.camera)
         single = camera.float()
         placed.append(replace(view, camera=single))
-    return Photographs(tuple(placed), placement, frames.layout, frames.placement is not None)
+    return Photographs(tuple(placed), unit_sphere, frames.layout, frames.unit_sphere is not None)
 
 
 def save_photographs(folder: Path, photographs: Photographs) -> None:
@@ -84,12 +84,12 @@ def save_photographs(folder: Path, photographs: Photographs) -> None:
             save_png(folder / "masks" / f"{name}.png", colour_picture(white))
         double = replace(view.camera, T_world_camera=view.camera.T_world_camera.double())
         entry["intrinsics"] = view.camera.intrinsics.tolist()
-        entry["T_world_camera"] = photographs.placement.camera_to_world(double).T_world_camera.tolist()
+        entry["T_world_camera"] = photographs.unit_sphere.camera_to_world(double).T_world_camera.tolist()
         entries.append(entry)
-    save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.placement.described()})
+    save_json(folder / own.NAME, {"views": entries, "unit_sphere": photographs.unit_sphere.described()})
 
 
-def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> Placement:
+def estimated(views: Sequence[Photograph], points: Float[np.ndarray, "points 3"] | None = None) -> UnitSphere:
     """Returns the sphere around the masks if two views have one, else around known points, else where cameras look.
 
     Raises `ValueError` where none of these tells.
@@ -135,7 +135,7 @@ def _photograph(frame: Frame) -> Photograph:
         matrices = torch.from_numpy(frame.intrinsics), torch.from_numpy(frame.T_world_camera)
         camera = Camera.from_matrices(*matrices, height, width)
         check_intrinsics(camera)
-    return Photograph(frame.image.stem, camera, image, mask, Source(frame.image, camera))
+    return Photograph(frame.image.stem, camera, image, mask, Source(frame.image, camera, frame.mask))
 
 
 def _remarks(view: Photograph) -> list[str]:

@@ -7,7 +7,7 @@ import re
 import shutil
 from pathlib import Path
 
-from distrace.data.debian import Mesh, by_hand, unpacked
+from distrace.data.debian import MeshEntry, by_hand, unpacked
 
 PACKAGE = "flightgear-data-ai"
 AIRCRAFT = "usr/share/games/flightgear/AI/Aircraft"
@@ -22,7 +22,7 @@ PARKED = "usr/share/games/flightgear/Scenery/Models/Aircraft"
 _TEXTURE = re.compile(r'^texture\s+"(?:[^"\n]*[/\\])?([^"\n]+)"', re.MULTILINE)
 
 
-def catalogue(deb: Path, folder: Path) -> list[Mesh]:
+def catalogue(deb: Path, folder: Path) -> list[MeshEntry]:
     """Returns the mesh of each aircraft, by its folder's name: of several liveries or variants the largest file.
 
     Raises `ValueError` if `deb` is missing, broken, or another package.
@@ -34,13 +34,13 @@ def catalogue(deb: Path, folder: Path) -> list[Mesh]:
         if models:
             largest = max(models, key=lambda path: path.stat().st_size)
             category = "other" if aircraft.name in NO_PLANES else "plane"
-            meshes.append(Mesh(category, aircraft.name, CREATOR, LICENCE, PACKAGE, largest.relative_to(folder)))
+            meshes.append(MeshEntry(category, aircraft.name, CREATOR, LICENCE, PACKAGE, largest.relative_to(folder)))
     if not meshes:
         raise ValueError(f"{deb} holds no aircraft ({AIRCRAFT}/*.ac); {by_hand(PACKAGE)}")
     return meshes
 
 
-def parked(deb: Path, folder: Path) -> list[Mesh]:
+def parked(deb: Path, folder: Path) -> list[MeshEntry]:
     """Returns each mesh by its file's name, helicopters and liveries among them: the split says what is learnt.
 
     Raises `ValueError` if `deb` is missing, broken, or another package.
@@ -49,7 +49,7 @@ def parked(deb: Path, folder: Path) -> list[Mesh]:
     paths = [path.relative_to(folder) for path in sorted(home.glob("*.ac"))]
     if not paths:
         raise ValueError(f"{deb} holds no aircraft ({PARKED}/*.ac); {by_hand(PARKED_PACKAGE)}")
-    return [Mesh("parked", path.stem, CREATOR, LICENCE, PARKED_PACKAGE, path) for path in paths]
+    return [MeshEntry("parked", path.stem, CREATOR, LICENCE, PARKED_PACKAGE, path) for path in paths]
 
 
 def _arrange(root: Path, home: Path) -> None:

@@ -27,10 +27,11 @@ def radius_of(points: Float[Tensor, "n 3"]) -> float:
     return RADIUS_FACTOR * float(away.quantile(RADIUS_SHARE))
 
 
-def thinned(rows: Tensor, most: int = MOST_POINTS) -> Tensor:
+def random_subset(rows: Tensor, most: int = MOST_POINTS, seed: int = 0) -> Tensor:
+    """Returns all rows, or `most` of them, drawn at random."""
     if len(rows) <= most:
         return rows
-    return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(0))[:most]]
+    return rows[torch.randperm(len(rows), generator=torch.Generator().manual_seed(seed))[:most]]
 
 
 def noise_of(points: Float[Tensor, "n 3"]) -> float:

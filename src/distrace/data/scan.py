@@ -10,7 +10,7 @@ from torch import Tensor
 from distrace.camera import Camera
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View
-from distrace.data.points import noise_of, radius_of, thinned
+from distrace.data.points import noise_of, radius_of, random_subset
 from distrace.data.segmented_view import SegmentedView, check_count, find_object
 from distrace.data.up import GIVEN_TILT, Up, rays_below
 from distrace.rays import Rays
@@ -61,15 +61,14 @@ class Scan:
 
     def sparse(self, count: int, seed: int = 0) -> "Scan":
         """Returns the scan with at most `count` of its points, drawn at random."""
-        chosen = torch.randperm(len(self.points), generator=torch.Generator().manual_seed(seed))[:count]
-        return replace(self, points=self.points[chosen])
+        return replace(self, points=random_subset(self.points, count, seed))
 
 
 def joined(scans: Sequence[Scan]) -> Scan:
     """Returns several scans of one object in one frame as one. Its noise is also the scans' disagreement."""
     if len(scans) == 1:
         return scans[0]
-    points = thinned(torch.cat([scan.points for scan in scans]))
+    points = random_subset(torch.cat([scan.points for scan in scans]))
     free = Rays.cat([scan.free for scan in scans])
     hits = Rays.cat([scan.hits for scan in scans])
     free_until = torch.cat([scan.free_until for scan in scans])
@@ -111,10 +110,10 @@ def _rays(
     camera: Camera, depth: Tensor, free: Bool[Tensor, "height width"], hits: Bool[Tensor, "height width"]
 ) -> tuple[Rays, Float[Tensor, "m"], Rays]:
     """Returns the rays that are free up to a depth, and those that hit."""
-    chosen = thinned(free.nonzero(), MOST_RAYS)
+    chosen = random_subset(free.nonzero(), MOST_RAYS)
     pixels = camera.pixels()[chosen[:, 0], chosen[:, 1]]
     until = depth[chosen[:, 0], chosen[:, 1]] / camera.cosines(pixels)
-    chosen = thinned(hits.nonzero(), MOST_RAYS)
+    chosen = random_subset(hits.nonzero(), MOST_RAYS)
     return camera.rays(pixels), until, camera.rays(camera.pixels()[chosen[:, 0], chosen[:, 1]])
 
 
@@ -137,7 +136,7 @@ def canonical_scan(seen: View | Cloud) -> Scan:
 
 def _scan(points: Tensor, free: Rays, free_until: Tensor, hits: Rays, up: Up, views: tuple[View, ...]) -> Scan:
     """Leaves out what is far from everything, and tells the noise."""
-    points = thinned(points)
+    points = random_subset(points)
     away = (points - points.median(0).values).norm(dim=-1)
     points = points[away <= FAR_OUTLIER * radius_of(points)]
     if not float((points - points[0]).norm(dim=-1).max()) > 0:

@@ -57,7 +57,9 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
 
 
 def _kind_of_all(paths: Sequence[Path]) -> str:
-    """Returns what all inputs are. Raises `ValueError` where they differ, as their options and frames do."""
+    """Returns what all inputs are. Raises `ValueError` where there are none, or of several kinds."""
+    if not paths:
+        raise ValueError("no input was given; give a depth image, an observation or a cloud of points")
     first_of_kind: dict[str, Path] = {}
     for path in paths:
         suffix = path.suffix.lower()

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.data.observation import View
-from distrace.data.points import LEAST_POINTS, object_points, radius_of, thinned
+from distrace.data.points import LEAST_POINTS, object_points, radius_of, random_subset
 from distrace.data.up import GIVEN_TILT, Floor, Up, find_floor
 from distrace.pixels import rectangle_around
 
@@ -56,7 +56,7 @@ def find_object(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, 
     inside = scene.seen if mask is None else scene.seen & mask
     check_count(int(inside.sum()))
     around = rectangle_around(inside, _margins)
-    floor = None if up.direction is None else find_floor(thinned(scene.masked(around).points()), up)
+    floor = None if up.direction is None else find_floor(random_subset(scene.masked(around).points()), up)
     if floor is not None:
         up = Up(floor.normal, floor.normal[None], GIVEN_TILT)
     points = scene.masked(inside).points()

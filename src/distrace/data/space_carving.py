@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.data.placement import ADVICE, Placement, nearest_to_rays, origins_of
+from distrace.data.unit_sphere import ADVICE, UnitSphere, nearest_to_rays, origins_of
 from distrace.pixels import thinned
 
 CELLS = 40  # along each axis
@@ -23,7 +23,7 @@ MAX_PIXELS = 20_000  # pixels of a mask that are looked at for the start
 MIN_VIEWS_SEEING = 0.5  # of the views, at least, see what is the object
 
 
-def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]) -> Placement:
+def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]) -> UnitSphere:
     """The smallest sphere around what lies in nearly all of the masks, and a margin.
 
     Raises `ValueError` where nothing does.
@@ -37,10 +37,10 @@ def within_masks(cameras: Sequence[Camera], masks: Sequence[Bool[Tensor, "_ _"]]
                 f" others? If they are right, {ADVICE}"
             )
         sphere = _smallest(places)
-    return Placement(sphere.centre, MARGIN * sphere.radius)
+    return UnitSphere(sphere.centre, MARGIN * sphere.radius)
 
 
-def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
+def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> UnitSphere:
     """About where the rays of the masks' middles meet, as large as the mask that reaches farthest from there."""
     seen = [camera.rays(camera.pixels()[thinned(mask, MAX_PIXELS)]).directions for camera, mask in zip(cameras, masks)]
     middles = torch.stack([directions.mean(0) for directions in seen]).double()
@@ -51,10 +51,10 @@ def _around(cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Placement:
         towards = centre - origin
         cosine = (directions.double() @ towards / towards.norm()).min().clamp(0, 1)
         radius = max(radius, (towards.norm() * (1 - cosine**2).sqrt()).item())
-    return Placement(centre, START_FACTOR * radius)
+    return UnitSphere(centre, START_FACTOR * radius)
 
 
-def _carved(sphere: Placement, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Float[Tensor, "places 3"]:
+def _carved(sphere: UnitSphere, cameras: Sequence[Camera], masks: Sequence[Tensor]) -> Float[Tensor, "places 3"]:
     """Middles of the cells around a sphere, in the world, that nearly all masks which see them allow."""
     steps = (torch.arange(CELLS, dtype=torch.float64) + 0.5) * 2 / CELLS - 1
     places = sphere.to_world(torch.cartesian_prod(steps, steps, steps))
@@ -92,9 +92,9 @@ def looked_up(
     return inside, hit
 
 
-def _smallest(points: Float[Tensor, "points 3"]) -> Placement:
+def _smallest(points: Float[Tensor, "points 3"]) -> UnitSphere:
     """The smallest sphere around points, to a percent: steps to the farthest (Bădoiu and Clarkson, SODA 2003)."""
     centre = points.mean(0)
     for step in range(1, 101):
         centre = centre + (points[(points - centre).norm(dim=-1).argmax()] - centre) / (step + 1)
-    return Placement(centre, (points - centre).norm(dim=-1).max().item())
+    return UnitSphere(centre, (points - centre).norm(dim=-1).max().item())

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from distrace.data.points import radius_of, thinned
+from distrace.data.points import radius_of, random_subset
 from distrace.rays import Rays
 from distrace.vectors import perpendicular
 
@@ -64,7 +64,7 @@ def find_floor(points: Float[Tensor, "n 3"], up: Up) -> Floor | None:
     assert up.direction is not None
     random = torch.Generator().manual_seed(0)
     thickness = FLOOR_THICKNESS * radius_of(points)
-    points = thinned(points, 2000)
+    points = random_subset(points, 2000)
     triples = points[torch.randint(len(points), (FLOOR_TRIALS, 3), generator=random)]
     normals = torch.linalg.cross(triples[:, 1] - triples[:, 0], triples[:, 2] - triples[:, 0])
     normals = torch.nn.functional.normalize(normals, dim=-1)

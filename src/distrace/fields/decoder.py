@@ -14,7 +14,7 @@ from torch.nn.utils.parametrizations import weight_norm
 from distrace.equality import summary
 from distrace.fields.base import SDF, flattened, in_chunks
 from distrace.fields.batch import BatchField
-from distrace.fields.products import Layer, Product, evaluate_layers, joined, linear
+from distrace.fields.products import Layer, Product, evaluate_layers, linear, linear_of_units_and_points
 from distrace.fields.pruning import Activity
 
 CHUNK = 1 << 20  # points evaluated at a time without derivatives
@@ -143,7 +143,7 @@ class Decoder(nn.Module):
     def _run(self, layers: list[Layer], points: Tensor, watch: Callable[[int, Tensor], None] | None = None) -> Tensor:
         x = points[..., :0]
         for layer, (weight, bias) in enumerate(layers):
-            x = joined(x, points, weight, bias) if self.is_fed(layer) else linear(x, weight, bias)
+            x = linear_of_units_and_points(x, points, weight, bias) if self.is_fed(layer) else linear(x, weight, bias)
             if layer < self.depth - 1:
                 if watch:
                     watch(layer, x)

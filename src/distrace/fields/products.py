@@ -24,7 +24,7 @@ def linear(x: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     return torch.addmm(bias, x, weight.t()) if bias.dim() == x.dim() == 2 else F.linear(x, weight) + bias
 
 
-def joined(units: Tensor, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
+def linear_of_units_and_points(units: Tensor, points: Tensor, weight: Tensor, bias: Tensor) -> Tensor:
     """Returns the outputs of a layer of units and points; points keep full precision under autocast."""
     if not torch.is_autocast_enabled(points.device.type):
         return linear(torch.cat([units, points], dim=-1), weight, bias)

@@ -19,7 +19,7 @@ from torch.nn.functional import normalize
 from distrace.checkpoints.model import model_folder
 from distrace.data.scan import Scan
 from distrace.errors import error_context
-from distrace.files import atomic_write
+from distrace.files import save_tensors
 from distrace.fitting.ray_sampling import drawn
 from distrace.pose import Similarity
 from distrace.rays import Rays, meet_sphere
@@ -226,8 +226,4 @@ def load_placement_network(model: str | Path) -> PlacementNetwork | None:
 
 def save_placement_network(path: Path, network: PlacementNetwork) -> None:
     """Writes a placement network in half precision, as a model's folder has it."""
-    tensors: dict[str, Tensor] = {}
-    for name, tensor in network.state_dict().items():
-        tensors[name] = (tensor.half() if tensor.is_floating_point() else tensor).contiguous()
-    with atomic_write(path) as file:
-        file.write(safetensors.torch.save(tensors))
+    save_tensors(path, network.state_dict())

@@ -124,12 +124,12 @@ def fit_photos(
 
     if config.comparison.fit_place:
         place = initialiser.likelier([place, initialiser.locate(fine, place)])
-        mean_shape = _Descent(PLACEMENT, PlacedShape(initialiser.mean_shape, place), config)
+        mean_shape = _PhotoDescent(PLACEMENT, PlacedShape(initialiser.mean_shape, place), config)
         mean_shape.run(levels, config.place_rounds, fit, callback)
         place = mean_shape.shape.place
 
     starts = initialiser.starts(place, config.starts)
-    descents = [_Descent(start, PlacedShape(w, place), config) for start, w in enumerate(starts)]
+    descents = [_PhotoDescent(start, PlacedShape(w, place), config) for start, w in enumerate(starts)]
     best = 0
     if config.tried:
         for descent in descents:
@@ -143,7 +143,7 @@ def fit_photos(
     return fit
 
 
-class _Descent:
+class _PhotoDescent:
     """One start on its way down, which can be interrupted between rounds."""
 
     def __init__(self, start: int, shape: PlacedShape, config: PhotoConfig) -> None:

@@ -24,7 +24,7 @@ def inconsistencies(photos: PhotoSet, shapes: Sequence[PlacedShape], seed: int) 
     scales is a product of their powers. Infinite where no point of a shape is seen by two views.
     """
     rays = photos.config.rays
-    samples = [photos.sample(shape, rays, torch.Generator().manual_seed(seed)) for shape in shapes]
+    samples = [photos.sample(shape, rays, torch.Generator().manual_seed(0)) for shape in shapes]
     labels = [torch.stack(views).mean(0) for views in zip(*map(photos.labels, samples), strict=True)]
     found = []
     evaluations = 0
@@ -50,9 +50,9 @@ class ViewAgreement:
     is_outlier: bool  # most often the camera is wrong
 
 
-def view_agreements(photos: PhotoSet, shape: PlacedShape, seed: int = 0) -> list[ViewAgreement]:
+def view_agreements(photos: PhotoSet, shape: PlacedShape) -> list[ViewAgreement]:
     """Each view's agreement with the others, by the lower median over them: one of them may have a wrong camera."""
-    sample = photos.sample(shape, photos.config.rays, torch.Generator().manual_seed(seed))
+    sample = photos.sample(shape, photos.config.rays, torch.Generator().manual_seed(0))
     differences = _pairwise_differences(*photos.problem(sample), len(photos.photographs)).nanmedian(1).values
     limit = outlier_limit(differences[differences.isfinite()].tolist(), LEAST_DIFFERENCE)
     return [

@@ -154,7 +154,7 @@ class ConsistentDepths:
 NO_DEPTHS = ConsistentDepths(Rays(torch.zeros(0, 3), torch.zeros(0, 3)), torch.zeros(0), torch.zeros(0))
 
 
-def depth_loss(values: Float[Tensor, "four_times_count"]) -> Float[Tensor, ""]:
+def consistent_depth_loss(values: Float[Tensor, "four_times_count"]) -> Float[Tensor, ""]:
     """The mean error of a field's values at the points of `ConsistentDepths.sample`, beyond the tolerance."""
     on, before, close, behind = values.chunk(4)
     free = (TOLERANCE - before).relu() + (TOLERANCE - close).relu()

@@ -19,7 +19,7 @@ from distrace.fields.base import SDF, value_and_gradient
 from distrace.rays import meet_sphere
 from distrace.reconstruction.losses import SHELL, PixelSampler, eikonal, loss_terms, normals_and_features
 from distrace.reconstruction.matching import PatchMatching
-from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths, depth_loss, plane_sweep
+from distrace.reconstruction.multiview_depth import NO_DEPTHS, ConsistentDepths, consistent_depth_loss, plane_sweep
 from distrace.reconstruction.networks import SurfaceNetwork
 from distrace.reconstruction.state import ReconstructConfig, Reconstruction
 from distrace.tracing.sphere_tracing import TraceConfig, sphere_trace
@@ -82,7 +82,7 @@ def _depths_in_hull(
     value, gradient = value_and_gradient(surface, torch.cat([points, depth_points]))
     distance = hull(points).relu()
     outside = torch.where(distance > 0, (distance - value[: len(points)]).relu(), 0.0)
-    loss = DEPTHS * depth_loss(value[len(points) :])
+    loss = DEPTHS * consistent_depth_loss(value[len(points) :])
     return outside.mean() + loss + EIKONAL_WITH_DEPTHS * eikonal(gradient)
 
 
@@ -119,7 +119,7 @@ def reconstruct(
             config.sharpness_at(state.step),
         )
         if len(depths):
-            terms["depths"] = depth_loss(surface(depths.sample(config.rays // 4, random).to(state.device)))
+            terms["depths"] = consistent_depth_loss(surface(depths.sample(config.rays // 4, random).to(state.device)))
         state.evaluations += surface.evaluations
         weighted = torch.stack([config.weight(name, len(depths) > 0) * term for name, term in terms.items()])
         yield _update(state, weighted.sum(), terms, config, began)

@@ -39,7 +39,7 @@ DENSE = 0.05  # share of pixels with a depth, above which dots would hide each o
 
 
 @dataclass(frozen=True)
-class View:
+class RenderedView:
     """One rendered state."""
 
     depth: Float[np.ndarray, "height width"]  # inf where there is none
@@ -48,14 +48,10 @@ class View:
     shaded: UInt8[np.ndarray, "height width 3"]
 
     @staticmethod
-    def of(buffers: Buffers, camera: Camera | None = None) -> "View":
-        """Returns the state as arrays; with its camera, the outline of the shaded picture is smooth."""
-        if camera is None:
-            shaded = shading.shaded_picture(buffers.normal, buffers.mask, buffers.rays.directions)
-        else:
-            shaded = smooth_outline(buffers, camera)
+    def of(buffers: Buffers, camera: Camera) -> "RenderedView":
+        """Returns the state as arrays."""
         depth, normal, mask = (image.detach().cpu().numpy() for image in (buffers.depth, buffers.normal, buffers.mask))
-        return View(depth, normal, mask, shaded)
+        return RenderedView(depth, normal, mask, smooth_outline(buffers, camera))
 
 
 @dataclass(frozen=True)
@@ -67,9 +63,9 @@ class Completion:
     observed_depth: Float[np.ndarray, "height width"]  # inf where there is none
     observed_mask: Bool[np.ndarray, "height width"] | None
     points_world: Float[np.ndarray, "n 3"]
-    before: View
-    after: View
-    truth: View | None
+    before: RenderedView
+    after: RenderedView
+    truth: RenderedView | None
     losses: dict[str, list[float]]  # a curve for each start, or for each term
     mesh: "trimesh.Trimesh"
     truth_surface: "trimesh.Trimesh | np.ndarray | None"  # a mesh, or points [m, 3]
@@ -159,8 +155,8 @@ def _depth_errors(completion: Completion) -> list[Html]:
     """Returns pictures of the errors in depth; none without the true depth."""
     if completion.truth is None:
         return []
-    before = shading.difference(completion.before.depth, completion.truth.depth)
-    after = shading.difference(completion.after.depth, completion.truth.depth)
+    before = shading.depth_difference(completion.before.depth, completion.truth.depth)
+    after = shading.depth_difference(completion.after.depth, completion.truth.depth)
     limit = max(float(np.nanquantile(np.abs(before), 0.9)), 1e-6) if np.isfinite(before).any() else 1.0
     pictures = [
         figure(shading.error_picture(before, limit), "Before the fit: depth − true depth"),

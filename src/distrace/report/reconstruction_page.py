@@ -31,7 +31,7 @@ FINER = 2  # rays along each side of a pixel: a photograph has means over areas
 
 
 @dataclass(frozen=True)
-class Judged:
+class ComparedView:
     """A photograph and its rendering: their difference, and both side by side."""
 
     name: str
@@ -41,7 +41,7 @@ class Judged:
 
 
 @torch.no_grad()
-def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
+def compared_view(state: Reconstruction, photograph: Photograph, size: int) -> ComparedView:
     """Renders the object as a photograph's camera sees it, with `size` pixels along the longer side.
 
     Raises `ValueError` for a photograph without a mask.
@@ -56,7 +56,7 @@ def judged(state: Reconstruction, photograph: Photograph, size: int) -> Judged:
         normal_picture(buffers.normal[::FINER, ::FINER], buffers.mask[::FINER, ::FINER], view.camera.T_world_camera),
         mask_comparison(mask, hit),
     ]
-    return Judged(photograph.name, -10 * math.log10(float(error)), iou(mask, hit), side_by_side(pictures))
+    return ComparedView(photograph.name, -10 * math.log10(float(error)), iou(mask, hit), side_by_side(pictures))
 
 
 @torch.no_grad()
@@ -93,23 +93,23 @@ def coloured_mesh(state: Reconstruction, config: MeshConfig) -> "trimesh.Trimesh
     return trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colours, process=False)
 
 
-def row_of(name: str, method: str, judgements: Mapping[str, Sequence[Judged]], seconds: float) -> dict[str, object]:
+def row_of(name: str, method: str, compared: Mapping[str, Sequence[ComparedView]], seconds: float) -> dict[str, object]:
     """Returns a row of the table of photographs: means over held-out views.
 
-    Each key of `judgements` names the cameras, and is appended to the columns' names.
+    Each key of `compared` names the cameras, and is appended to the columns' names.
     """
     numbers: dict[str, object] = {}
-    for cameras, views in judgements.items():
+    for cameras, views in compared.items():
         numbers[f"psnr{cameras}"] = round(mean(view.psnr for view in views), 2)
         numbers[f"silhouette_iou{cameras}"] = round(mean(view.silhouette_iou for view in views), 4)
-    count = len(next(iter(judgements.values())))
+    count = len(next(iter(compared.values())))
     return {"object": name, "method": method, **numbers, "views_held_out": count, "seconds": round(seconds)}
 
 
 def reconstruction_page(
     name: str,
-    held_out: Sequence[Judged],
-    fitted_to: Sequence[Judged],
+    held_out: Sequence[ComparedView],
+    fitted_to: Sequence[ComparedView],
     loss_history: Mapping[str, Sequence[float]],
     mesh: "trimesh.Trimesh",
     facts: Mapping[str, str],
@@ -129,5 +129,5 @@ def reconstruction_page(
     )
 
 
-def _shown(view: Judged) -> Html:
+def _shown(view: ComparedView) -> Html:
     return figure(view.picture, f"{view.name}: {view.psnr:.1f} dB, intersection over union {view.silhouette_iou:.3f}")

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
+from distrace.antialiasing import clay_picture
 from distrace.camera import Camera
 from distrace.checkpoints.model import Model
 from distrace.data.photograph import Photograph
@@ -15,7 +16,6 @@ from distrace.photos.fit_photos import PhotoStep
 from distrace.photos.judge import ViewAgreement
 from distrace.render import Buffers, render
 from distrace.report.charts import curves
-from distrace.report.completion_page import View
 from distrace.report.page import figure, page, paragraph, row, section, table
 from distrace.report.scene import space_section
 from distrace.shading import EXTRA, Picture, colour_picture, side_by_side
@@ -61,8 +61,7 @@ def forming(model: Model, steps: Sequence[PhotoStep], camera: Camera) -> UInt8[n
     """Returns renderings of the shape during the best start of the fit, the last step included."""
     best = [step for step in steps if step.start == steps[-1].start]
     frames = [*best[:: -(-len(best) // FRAMES)], best[-1]]
-    pictures = [View.of(_rendered(model, step, camera)).shaded for step in frames]
-    return np.stack(pictures)
+    return np.stack([clay_picture(_rendered(model, step, camera)) for step in frames])
 
 
 def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
@@ -71,7 +70,7 @@ def _beside(model: Model, step: PhotoStep, view: Photograph) -> Picture:
     buffers = _rendered(model, step, view.camera)
     picture = colour_picture(small.image.cpu())
     picture[band(buffers.mask, 3).cpu().numpy()] = EXTRA
-    return side_by_side([picture, View.of(buffers).shaded])
+    return side_by_side([picture, clay_picture(buffers)])
 
 
 @torch.no_grad()

@@ -12,7 +12,7 @@ from distrace.fields.decoder import NetworkSpecs
 from distrace.files import atomic_write
 from distrace.training.config import TrainConfig
 from distrace.training.losses import STEPS_PER_LOSS
-from distrace.training.trainer import Training, start
+from distrace.training.trainer import Training, start_training
 
 NAME = "checkpoint.pt"
 
@@ -45,7 +45,7 @@ def load_training(folder: Path, names: list[str], device: torch.device) -> tuple
         state = torch.load(path, map_location=device, weights_only=True)
         config = TrainConfig(**state["config"])
         specs = NetworkSpecs(**state["specs"])
-        training = start(len(state["names"]), specs, config, device)
+        training = start_training(len(state["names"]), specs, config, device)
         training.decoder.load_state_dict(state["decoder"])
         training.codes.data.copy_(state["codes"])
         training.optimiser.load_state_dict(state["optimiser"])

@@ -31,7 +31,7 @@ class Training:
 
 
 @dataclass(frozen=True)
-class Step:
+class TrainingStep:
     """One step done: its loss, and how long it took."""
 
     step: int
@@ -39,7 +39,7 @@ class Step:
     seconds: float
 
 
-def start(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
+def start_training(shapes: int, specs: NetworkSpecs, config: TrainConfig, device: torch.device) -> Training:
     """A fresh network and codes, from the configuration's seed."""
     torch.manual_seed(config.seed)
     decoder = Decoder(specs).to(device)
@@ -63,7 +63,7 @@ def begin_with(training: Training, names: list[str], model: Model) -> None:
 
 def train(
     samples: Samples, training: Training, config: TrainConfig, distillation: Distillation | None = None
-) -> Iterator[Step]:
+) -> Iterator[TrainingStep]:
     """Trains in place and yields after every step, from wherever `training` is to the last one.
 
     The loss of `distillation` has the weight `config.keep`. A step's random draw depends on the seed and the step
@@ -84,7 +84,7 @@ def train(
         loss = step(shapes.to(device), batch, *between).item()
         record(training.losses, training.step, loss)
         training.step += 1
-        yield Step(training.step, loss, time.perf_counter() - began)
+        yield TrainingStep(training.step, loss, time.perf_counter() - began)
 
 
 def _step(
@@ -147,6 +147,6 @@ def faster_in_bfloat16(specs: NetworkSpecs, device: torch.device) -> bool:
     for bfloat16 in (False, True, False, True):  # the second time of each counts
         config = TrainConfig(steps=2, bfloat16=bfloat16)
         random = [torch.rand(4096, 4) * 0.1]
-        run = train(Samples(["random"], random, random).to(device), start(1, specs, config, device), config)
+        run = train(Samples(["random"], random, random).to(device), start_training(1, specs, config, device), config)
         seconds[bfloat16] = min(step.seconds for step in run)
     return seconds[True] < seconds[False]

@@ -2,11 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from distrace import shading
 from distrace.render import Buffers
@@ -22,40 +21,26 @@ Light = Float[np.ndarray, "3"] | None
 
 @dataclass(frozen=True)
 class Image:
-    """Traced bands, from the top; each array is made when a layer asks for it."""
+    """Traced bands, from the top."""
 
     bands: Sequence[Buffers]
 
-    @cached_property
+    def array(self, part: Callable[[Buffers], torch.Tensor]) -> np.ndarray:
+        """Returns a part of every band as one array [height, width, …]."""
+        return torch.cat([part(band) for band in self.bands]).detach().cpu().numpy()
+
+    @property
     def depth(self) -> Float[np.ndarray, "height width"]:
-        return _joined([band.depth for band in self.bands])
+        return self.array(lambda band: band.depth)
 
-    @cached_property
+    @property
     def mask(self) -> Bool[np.ndarray, "height width"]:
-        return _joined([band.mask for band in self.bands])
-
-    @cached_property
-    def normal(self) -> Float[np.ndarray, "height width 3"]:
-        return _joined([band.normal for band in self.bands])
-
-    @cached_property
-    def directions(self) -> Float[np.ndarray, "height width 3"]:
-        return _joined([band.rays.directions for band in self.bands])
-
-    @cached_property
-    def evaluations(self) -> Int[np.ndarray, "height width"]:
-        return _joined([band.trace.evaluations for band in self.bands])
-
-    @cached_property
-    def error(self) -> Float[np.ndarray, "height width"]:
-        """|f| at the points that were found; 0 where nothing was hit."""
-        values = [torch.zeros_like(band.depth).masked_scatter(band.mask, _values(band)) for band in self.bands]
-        return _joined(values)
+        return self.array(lambda band: band.mask)
 
     @property
     def doubtful(self) -> int:
         """Rays that ended without an answer, or start inside the solid."""
-        outcomes = _joined([band.trace.outcome for band in self.bands])
+        outcomes = self.array(lambda band: band.trace.outcome)
         return int(np.isin(outcomes, [int(Outcome.EXHAUSTED), int(Outcome.INSIDE)]).sum())
 
     @property
@@ -63,16 +48,10 @@ class Image:
         return sum(band.trace.total_evaluations for band in self.bands)
 
 
-def _joined(parts: Sequence[torch.Tensor]) -> np.ndarray:
-    return torch.cat(list(parts)).detach().cpu().numpy()
-
-
-def _values(band: Buffers) -> torch.Tensor:
-    return band.field_at(band.mask)(band.points).abs()
-
-
 def _shaded(image: Image, light: Light) -> tuple[Picture, str]:
-    return shading.shaded_picture(image.normal, image.mask, image.directions, light), ""
+    normal = image.array(lambda band: band.normal)
+    directions = image.array(lambda band: band.rays.directions)
+    return shading.shaded_picture(normal, image.mask, directions, light), ""
 
 
 def _depth(image: Image, light: Light) -> tuple[Picture, str]:
@@ -81,19 +60,26 @@ def _depth(image: Image, light: Light) -> tuple[Picture, str]:
 
 
 def _normal(image: Image, light: Light) -> tuple[Picture, str]:
-    return shading.normal_picture(image.normal, image.mask), "red, green, blue: x, y, z of the normal"
+    picture = shading.normal_picture(image.array(lambda band: band.normal), image.mask)
+    return picture, "red, green, blue: x, y, z of the normal"
 
 
 def _evaluations(image: Image, light: Light) -> tuple[Picture, str]:
-    most = max(int(image.evaluations.max()), 1)
-    everywhere = np.ones_like(image.mask)
-    return shading.heat_picture(image.evaluations / most, everywhere), f"violet 0 – yellow {most} evaluations of a ray"
+    evaluations = image.array(lambda band: band.trace.evaluations)
+    most = max(int(evaluations.max()), 1)
+    everywhere = np.ones_like(evaluations, dtype=bool)
+    return shading.heat_picture(evaluations / most, everywhere), f"violet 0 – yellow {most} evaluations of a ray"
 
 
 def _error(image: Image, light: Light) -> tuple[Picture, str]:
     low, high = ERRORS
-    share = (np.log10(np.maximum(image.error, 10**low)) - low) / (high - low)
+    share = (np.log10(np.maximum(image.array(_residual), 10**low)) - low) / (high - low)
     return shading.heat_picture(share, image.mask), f"violet |f| ≤ 1e{low:.0f} – yellow 1e{high:.0f} radii"
+
+
+def _residual(band: Buffers) -> torch.Tensor:
+    """Returns |f| at the points that were found; 0 where nothing was hit."""
+    return torch.zeros_like(band.depth).masked_scatter(band.mask, band.field_at(band.mask)(band.points).abs())
 
 
 LAYERS: dict[str, Callable[[Image, Light], tuple[Picture, str]]] = {

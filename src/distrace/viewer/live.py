@@ -59,7 +59,7 @@ class Shown:
         return LAYERS[self.layer](image, self.light)
 
 
-def camera_of(handle: "CameraHandle", height: int) -> Camera:
+def browser_camera(handle: "CameraHandle", height: int) -> Camera:
     """Returns a browser's camera, with so many rows of pixels."""
     from viser.transforms import SO3
 
@@ -107,11 +107,11 @@ class LiveView:
         heights = [height for height in HEIGHTS if height <= max(self.client.camera.image_height, HEIGHTS[0])]
         if self.finished is not None:
             field, camera, image = self.finished
-            if field is shown.field and camera == camera_of(self.client.camera, camera.height):
+            if field is shown.field and camera == browser_camera(self.client.camera, camera.height):
                 self._send(shown, camera, image, 0.0)
                 heights = [height for height in heights if height > camera.height]
         for height in heights:
-            camera = camera_of(self.client.camera, height)
+            camera = browser_camera(self.client.camera, height)
             began = time.perf_counter()
             image = self._traced(shown, camera)
             if image is None:

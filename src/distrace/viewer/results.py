@@ -14,9 +14,9 @@ from distrace.checkpoints.codes import code_title, model_source, named_code
 from distrace.checkpoints.model import load_model
 from distrace.data.observation import read_view
 from distrace.data.photo_readers.transforms import read_cameras
-from distrace.data.placement import placement_of
 from distrace.data.saved_scan import read_scan
 from distrace.data.scan import Scan
+from distrace.data.unit_sphere import UnitSphere, unit_sphere_of
 from distrace.errors import error_context
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
 from distrace.fitting.scan_residuals import PlacedCode
@@ -99,11 +99,9 @@ def _photographed(folder: Path, content: dict[str, Any]) -> list[Camera]:
         return []
     path = folder / "result.json"
     with error_context(f"{path} does not say where the object is", path):
-        sphere = content["unit_sphere"]
-        unit = placement_of(sphere["centre"], sphere["radius"])
+        unit = unit_sphere_of(content["unit_sphere"])
         place = Similarity.from_matrix(torch.tensor(content["T_unit_object"]))
-    cameras = read_cameras(folder / "transforms.json")
-    return [place.camera_in_object(unit.camera_to_unit(camera).float()) for camera in cameras]
+    return [place.camera_in_object(camera) for camera in _cameras(folder, unit)]
 
 
 def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device) -> Scene:
@@ -113,13 +111,17 @@ def _reconstruction(folder: Path, content: dict[str, Any], device: torch.device)
         settings = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         surface = SurfaceNetwork(SurfaceSpecs(**{key: value for key, value in settings.items() if key in names}))
         surface.load_state_dict(torch.load(path, map_location="cpu", weights_only=True)["surface"])
-        sphere = content["unit_sphere"]
-        unit = placement_of(sphere["centre"], sphere["radius"])
-    cameras: list[Camera] = []
-    if (folder / "transforms.json").is_file():
-        cameras = [unit.camera_to_unit(camera).float() for camera in read_cameras(folder / "transforms.json")]
+        unit = unit_sphere_of(content["unit_sphere"])
     field = surface.requires_grad_(False).eval().to(device)
-    return Scene(f"{folder.name}, a reconstruction", field, cameras=cameras, place=unit.similarity, device=device)
+    return Scene(
+        f"{folder.name}, a reconstruction", field, cameras=_cameras(folder, unit), place=unit.similarity, device=device
+    )
+
+
+def _cameras(folder: Path, unit: UnitSphere) -> list[Camera]:
+    """Returns the cameras of `transforms.json` in the unit sphere; none where there is no such file."""
+    path = folder / "transforms.json"
+    return [unit.camera_to_unit(camera).float() for camera in read_cameras(path)] if path.is_file() else []
 
 
 def _placement(path: Path) -> Similarity:

@@ -18,7 +18,7 @@ from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.optional import require
 from distrace.shading import save_png
 from distrace.viewer.image import Light
-from distrace.viewer.live import TRACING, LiveView, Shown, TracedField, camera_of
+from distrace.viewer.live import TRACING, LiveView, Shown, TracedField, browser_camera
 from distrace.viewer.scene import Scene
 
 if TYPE_CHECKING:
@@ -126,7 +126,7 @@ class Viewer:
         if scene.code is not None:
             save_code(folder, scene.code, scene.place)
         if handle is not None:
-            picture, _ = shown.picture(shown.field.image(camera_of(handle, SAVED_ROWS)))
+            picture, _ = shown.picture(shown.field.image(browser_camera(handle, SAVED_ROWS)))
             save_png(folder / "picture.png", picture)
         save_json(folder / "result.json", {"model": scene.source, "title": scene.title})
         return folder

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from struct import error, unpack_from
 
-Step = Callable[[bytes, int], int]  # from the start of a record to its end
+Walk = Callable[[bytes, int], int]  # from the start of a record to its end
 
 
 def check_whole(model: Path) -> None:
@@ -36,7 +36,7 @@ def _describes_image(line: str) -> bool:
     return len(words) >= 10 and (len(words) % 3 != 0 or not words[-1].lstrip("-").isdecimal())
 
 
-def _whole(content: bytes, step: Step) -> bool:
+def _whole(content: bytes, step: Walk) -> bool:
     try:
         at = 8
         for _ in range(_count(content, 0)):
@@ -83,4 +83,10 @@ def _frame(content: bytes, at: int) -> int:
     return at + 68 + 16 * _count(content, at + 64, "<I")
 
 
-RECORDS: dict[str, Step] = {"cameras": _camera, "images": _image, "points3D": _point, "rigs": _rig, "frames": _frame}
+RECORDS: dict[str, Walk] = {
+    "cameras": _camera,
+    "images": _image,
+    "points3D": _point,
+    "rigs": _rig,
+    "frames": _frame,
+}

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.errors import error_context
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
@@ -31,11 +31,11 @@ class Frame:
 
 @dataclass(frozen=True)
 class Frames:
-    """All views, and where the folder has them the unit sphere's placement and points of the scene."""
+    """All views, and where the folder has them the unit sphere and points of the scene."""
 
     layout: str
     views: tuple[Frame, ...]
-    placement: Placement | None = None
+    unit_sphere: UnitSphere | None = None
     points: Float[np.ndarray, "points 3"] | None = None
 
 
@@ -48,7 +48,7 @@ def read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def listed(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
+def object_list(content: dict[str, Any], name: str, path: Path) -> list[dict[str, Any]]:
     """A list of objects in a JSON file; raises `ValueError` for anything else."""
     entries = content.get(name)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):

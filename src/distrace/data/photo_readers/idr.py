@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from distrace.data.photo_readers.frames import Frame, Frames, images_in, matrix
-from distrace.data.placement import Placement
+from distrace.data.unit_sphere import UnitSphere
 from distrace.errors import about, error_context
 
 NAME = "cameras_sphere.npz"
@@ -30,7 +30,7 @@ def read(folder: Path) -> Frames | None:
         return Frames("IDR", ())
     places = masks or [None] * len(images)
     frames = tuple(_frame(path, matrices, k, image, mask) for k, (image, mask) in enumerate(zip(images, places)))
-    return Frames("IDR", frames, _placement(path, matrices, len(images)))
+    return Frames("IDR", frames, _unit_sphere(path, matrices, len(images)))
 
 
 def _matrices(path: Path) -> dict[str, np.ndarray]:
@@ -80,7 +80,7 @@ def decomposed(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return upper / upper[2, 2], pose
 
 
-def _placement(path: Path, matrices: dict[str, np.ndarray], count: int) -> Placement:
+def _unit_sphere(path: Path, matrices: dict[str, np.ndarray], count: int) -> UnitSphere:
     with about(path):
         scales = [matrix(matrices, f"scale_mat_{k}", 4, 4) for k in range(count)]
         first = scales[0]
@@ -93,4 +93,4 @@ def _placement(path: Path, matrices: dict[str, np.ndarray], count: int) -> Place
         for k, scale in enumerate(scales):
             if np.abs(scale - first).max() > TOLERANCE * radius:
                 raise ValueError(f"scale_mat_{k} is another than scale_mat_0; all views are of one unit sphere")
-    return Placement(torch.from_numpy(first[:3, 3].copy()), radius)
+    return UnitSphere(torch.from_numpy(first[:3, 3].copy()), radius)

@@ -3,8 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from distrace.data.photo_readers.frames import Frame, Frames, file_of, listed, matrix, read_json
-from distrace.data.placement import Placement, placement_of
+from distrace.data.photo_readers.frames import Frame, Frames, file_of, matrix, object_list, read_json
+from distrace.data.unit_sphere import UnitSphere, unit_sphere_of
 from distrace.errors import about
 
 NAME = "views.json"
@@ -16,9 +16,9 @@ def read(folder: Path) -> Frames | None:
     if not path.is_file():
         return None
     content = read_json(path)
-    entries = listed(content, "views", path)
+    entries = object_list(content, "views", path)
     frames = tuple(_frame(folder, entry, f"{path}: views[{k}]") for k, entry in enumerate(entries))
-    return Frames("views.json", frames, _placement(content, path))
+    return Frames("views.json", frames, _unit_sphere(content, path))
 
 
 def _frame(folder: Path, entry: dict[str, Any], field: str) -> Frame:
@@ -28,11 +28,9 @@ def _frame(folder: Path, entry: dict[str, Any], field: str) -> Frame:
         return Frame(field, image, matrix(entry, "intrinsics", 3, 3), matrix(entry, "T_world_camera", 4, 4), mask)
 
 
-def _placement(content: dict[str, Any], path: Path) -> Placement | None:
+def _unit_sphere(content: dict[str, Any], path: Path) -> UnitSphere | None:
     sphere = content.get("unit_sphere")
     if sphere is None:
         return None
     with about(f"{path}: unit_sphere"):
-        if not isinstance(sphere, dict):
-            raise ValueError(f"it is {sphere!r}; it has a centre and a radius")
-        return placement_of(sphere.get("centre"), sphere.get("radius"))
+        return unit_sphere_of(sphere)

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 
 from distrace.camera import Camera
-from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, listed, matrix, read_json
+from distrace.data.photo_readers.frames import SUFFIXES, Frame, Frames, file_of, matrix, object_list, read_json
+from distrace.data.photograph import Source
 from distrace.data.pictures import picture_size
-from distrace.data.placement import MAX_COORDINATE
+from distrace.data.unit_sphere import MAX_COORDINATE
 from distrace.errors import about
-from distrace.files import save_json
+from distrace.files import atomic_write, save_json
 
 NAMES = ("transforms.json", "transforms_train.json")
 UNDISTORTED = ("PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE")  # if terms are zero
@@ -32,7 +33,7 @@ def read(folder: Path) -> Frames | None:
     if path is None:
         return None
     content = read_json(path)
-    entries = listed(content, "frames", path)
+    entries = object_list(content, "frames", path)
     frames = tuple(_frame(folder, content | entry, f"{path}: frames[{k}]") for k, entry in enumerate(entries))
     return Frames(path.name, frames)
 
@@ -96,33 +97,48 @@ def _number(entry: dict[str, Any], name: str) -> float:
     return float(value)
 
 
-def save_cameras(path: Path, cameras: Mapping[Path, Camera]) -> None:
-    """Writes the cameras of images, by their files, as nerfstudio and instant-ngp read them: paths are from `path`."""
+def save_transforms(folder: Path, sources: Mapping[str, Source]) -> None:
+    """Writes photographs, by their names, as `read`, nerfstudio and instant-ngp read them.
+
+    Images and masks outside of the folder are copied to `images` and `masks` in it.
+    """
     frames = []
-    folder = path.parent.resolve()
-    for file, camera in cameras.items():
+    for name, source in sources.items():
+        camera = source.camera
         intrinsics = camera.intrinsics.tolist()
         pose = camera.T_world_camera.cpu().double().numpy() @ OPENGL
-        frames.append(
-            {
-                "file_path": Path(os.path.relpath(file.parent.resolve() / file.name, folder)).as_posix(),
-                "w": camera.width,
-                "h": camera.height,
-                "fl_x": intrinsics[0][0],
-                "fl_y": intrinsics[1][1],
-                "cx": intrinsics[0][2],
-                "cy": intrinsics[1][2],
-                "transform_matrix": pose.tolist(),
-            }
-        )
-    save_json(path, {"camera_model": "PINHOLE", "frames": frames})
+        frame = {
+            "file_path": _path_within(folder, source.image, f"images/{name}"),
+            "w": camera.width,
+            "h": camera.height,
+            "fl_x": intrinsics[0][0],
+            "fl_y": intrinsics[1][1],
+            "cx": intrinsics[0][2],
+            "cy": intrinsics[1][2],
+            "transform_matrix": pose.tolist(),
+        }
+        if source.mask is not None:
+            frame["mask_path"] = _path_within(folder, source.mask, f"masks/{name}")
+        frames.append(frame)
+    save_json(folder / "transforms.json", {"camera_model": "PINHOLE", "frames": frames})
+
+
+def _path_within(folder: Path, file: Path, name: str) -> str:
+    """Returns the path of a file from the folder; one outside, which `read` would refuse, is copied to `name` first."""
+    top = Path(os.path.abspath(folder))
+    path = Path(os.path.abspath(file))
+    if not path.is_relative_to(top):
+        path = top / f"{name}{file.suffix}"
+        with atomic_write(path) as copy:
+            copy.write(file.read_bytes())
+    return path.relative_to(top).as_posix()
 
 
 def read_cameras(path: Path) -> list[Camera]:
     """Reads the cameras alone, in double, without their images. Raises `ValueError` as `read` does."""
     content = read_json(path)
     cameras = []
-    for number, entry in enumerate(listed(content, "frames", path)):
+    for number, entry in enumerate(object_list(content, "frames", path)):
         with about(f"{path}: frames[{number}]"):
             frame = content | entry
             size = (int(_number(frame, "h")), int(_number(frame, "w")))

@@ -1,4 +1,4 @@
-"""Where the unit sphere lies in the world of a folder of photographs, as given or estimated."""
+"""The unit sphere in the world of a folder of photographs, as given or estimated."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ ADVICE = "tell where the object is as unit_sphere in views.json"
 
 
 @dataclass(frozen=True)
-class Placement:
+class UnitSphere:
     """World = centre + radius · unit: centre and radius of the unit sphere, in the units of the folder's world."""
 
     centre: Float[Tensor, "3"]  # in double: worlds may lie far from their origin
@@ -51,8 +51,12 @@ class Placement:
         return {"centre": self.centre.tolist(), "radius": self.radius}
 
 
-def placement_of(centre: object, radius: object) -> Placement:
-    """Raises `ValueError` where they are not three finite numbers and a positive one."""
+def unit_sphere_of(described: object) -> UnitSphere:
+    """Reads what `UnitSphere.described` returns. Raises `ValueError` for anything else."""
+    if not isinstance(described, dict):
+        raise ValueError(f"it is {described!r}; it has a centre and a radius")
+    centre = described.get("centre")
+    radius = described.get("radius")
     numbers: list[Any] = [*centre, radius] if isinstance(centre, list) else []
     finite = all(isinstance(value, int | float) and abs(value) <= MAX_COORDINATE for value in numbers)
     if len(numbers) != 4 or not finite or not numbers[3] > 0:
@@ -60,20 +64,20 @@ def placement_of(centre: object, radius: object) -> Placement:
             f"its centre is {centre} and its radius {radius}; three numbers and a positive one are needed, in the units"
             " of T_world_camera"
         )
-    return Placement(torch.tensor(numbers[:3], dtype=torch.float64), float(numbers[3]))
+    return UnitSphere(torch.tensor(numbers[:3], dtype=torch.float64), float(numbers[3]))
 
 
-def among_points(points: Float[np.ndarray, "points 3"]) -> Placement | None:
+def among_points(points: Float[np.ndarray, "points 3"]) -> UnitSphere | None:
     """The sphere around the median of points that holds nine in ten of them, and a margin; None for too few."""
     if len(points) < MIN_POINTS:
         return None
     positions = torch.from_numpy(points).double()
     centre = positions.median(0).values
     radius = (positions - centre).norm(dim=-1).quantile(POINTS_INSIDE).item() * MARGIN
-    return Placement(centre, radius) if radius > 0 else None
+    return UnitSphere(centre, radius) if radius > 0 else None
 
 
-def between_axes(cameras: Sequence[Camera]) -> Placement:
+def between_axes(cameras: Sequence[Camera]) -> UnitSphere:
     """The sphere around what the views show whole, about the point nearest to the rays of their middles.
 
     Its radius is the median of distance · sin(half of the diagonal field of view): of the smaller field, as much as
@@ -84,7 +88,7 @@ def between_axes(cameras: Sequence[Camera]) -> Placement:
     centre = nearest_to_rays(origins_of(cameras), middles)
     distance = (centre - origins_of(cameras)).norm(dim=-1)
     half = torch.stack([_half_field(camera) for camera in cameras]).double()
-    return Placement(centre, (distance * half.sin()).median().item())
+    return UnitSphere(centre, (distance * half.sin()).median().item())
 
 
 def origins_of(cameras: Sequence[Camera]) -> Float[Tensor, "views 3"]:

@@ -9,8 +9,8 @@ import torch
 from photographed import POINT, WORLD, ball, in_world
 
 from distrace.camera import Camera
-from distrace.data.placement import Placement, among_points, between_axes, nearest_to_rays
 from distrace.data.space_carving import within_masks
+from distrace.data.unit_sphere import UnitSphere, among_points, between_axes, nearest_to_rays
 
 RING = [Camera.orbit(40 * k, 20 * (k % 3) - 10, 4.0, height=48, width=64, focal_px=64.0) for k in range(9)]
 
@@ -33,16 +33,16 @@ def test_a_camera_sees_the_same_pixel_in_both_frames() -> None:
 
 
 def test_a_centre_far_away_is_not_rounded_before_it_is_subtracted() -> None:
-    far = Placement(torch.tensor([1e6, 0.3, 0.0], dtype=torch.float64), 2.0)
+    far = UnitSphere(torch.tensor([1e6, 0.3, 0.0], dtype=torch.float64), 2.0)
     point = torch.tensor([1e6 + 1.0, 0.0, 0.0], dtype=torch.float64)
     torch.testing.assert_close(far.to_unit(point), torch.tensor([0.5, -0.15, 0.0], dtype=torch.float64))
 
 
 def test_axes_through_a_point_meet_there_and_the_sphere_is_around_what_the_views_show() -> None:
-    placement = between_axes([WORLD.camera_to_world(camera) for camera in RING])
-    torch.testing.assert_close(placement.centre, WORLD.centre, atol=1e-4, rtol=0)
+    unit_sphere = between_axes([WORLD.camera_to_world(camera) for camera in RING])
+    torch.testing.assert_close(unit_sphere.centre, WORLD.centre, atol=1e-4, rtol=0)
     half = math.atan(math.hypot(24, 32) / 64)
-    assert placement.radius == pytest.approx(WORLD.radius * 4 * math.sin(half), rel=1e-4)
+    assert unit_sphere.radius == pytest.approx(WORLD.radius * 4 * math.sin(half), rel=1e-4)
 
 
 def test_a_cropped_camera_is_followed_along_the_middle_of_its_image() -> None:
@@ -79,19 +79,19 @@ def test_points_tell_the_sphere_although_some_are_far_away() -> None:
     ball_points = drawn.normal(size=(500, 3))
     ball_points *= 2 * drawn.random((500, 1)) ** (1 / 3) / np.linalg.norm(ball_points, axis=1, keepdims=True)
     points = np.concatenate([ball_points + np.arange(1, 4), drawn.normal(size=(25, 3)) * 100])
-    placement = among_points(points)
-    assert placement is not None
-    assert (placement.centre - torch.tensor([1.0, 2, 3])).norm() < 0.3
-    assert 1.9 < placement.radius < 2.5
+    unit_sphere = among_points(points)
+    assert unit_sphere is not None
+    assert (unit_sphere.centre - torch.tensor([1.0, 2, 3])).norm() < 0.3
+    assert 1.9 < unit_sphere.radius < 2.5
     assert among_points(points[:5]) is None
 
 
 @pytest.mark.parametrize("radius", [0.15, 0.5])
 def test_masks_of_a_ball_tell_a_sphere_that_just_encloses_it(radius: float) -> None:
     masks = [ball(camera, radius) for camera in RING]
-    placement = within_masks([WORLD.camera_to_world(camera) for camera in RING], masks)
-    away = (placement.centre - WORLD.centre).norm().item() / WORLD.radius
-    found = placement.radius / WORLD.radius
+    unit_sphere = within_masks([WORLD.camera_to_world(camera) for camera in RING], masks)
+    away = (unit_sphere.centre - WORLD.centre).norm().item() / WORLD.radius
+    found = unit_sphere.radius / WORLD.radius
     pixel = 4 / 64
     assert radius - pixel / 2 <= found - away
     assert found + away < 1.3 * radius + 2 * pixel, "a hull of nine views and pixels is larger than the ball"
