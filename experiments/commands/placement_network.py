@@ -23,8 +23,8 @@ class TrainPlacement:
     category: tyro.conf.Positional[Literal["sofas", "chairs", "tables", "planes"]]
     meshes: Meshes = Path("out")
     out: Path | None = None  # by default out/placement-sofas and so on
-    scans: int = 3500
-    steps: int = 1600
+    scans: int = 4500
+    steps: int = 2000
     seed: int = 0
 
     def run(self) -> None:
