@@ -25,6 +25,7 @@ HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=0.1, even=True, settled=0.0)
 MEAN_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
+SURFACE_POINTS = 2000.0  # what all points count together
 SILHOUETTE_RAYS = 4000.0  # what all rays of an exact silhouette count together; less where there are few
 LAST_MARGIN = 0.25  # deviations that a free ray keeps from the surface in the last round
 ROUGH = 3.0  # × the deviation, in the first round
@@ -217,6 +218,7 @@ def minimised(
             samples=stage.samples,
             moves=False,
             code_deviation=MEAN_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
+            effective_points=SURFACE_POINTS,
             effective_rays=SILHOUETTE_RAYS * min(1.0, len(sample.until) / max(stage.rays, 1)),
             margin=stage.margin,
         )

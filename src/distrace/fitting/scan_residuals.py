@@ -23,8 +23,8 @@ from distrace.rays import Rays, meet_sphere
 
 CODE_DEVIATION = 0.7  # of a code's coordinates from those that it starts from
 GROWTH = 0.25  # standard deviation of the logarithm of the size, about the size that the start has
-EFFECTIVE_POINTS = 200.0  # what all points count together, however many: errors of a shape are alike nearby
-EFFECTIVE_RAYS = 600.0  # the same, of rays where a mask may be wrong
+EFFECTIVE_POINTS = 200.0  # of a scan: what all points count together, as errors of a shape are alike nearby …
+EFFECTIVE_RAYS = 600.0  # … and all rays
 FINE_SAMPLES = 4  # points about the least sample of a ray
 MARGIN = 0.7  # deviations that a free ray keeps from the surface
 POINT_DEPTH = 0.3  # deviations that points of a scan lie inside, so that a thin sheet has an inside
@@ -105,6 +105,7 @@ class ScanProblem:
     samples: int  # on each ray, at which its least value is sought
     moves: bool = True  # whether the placement is unknown
     code_deviation: float = CODE_DEVIATION
+    effective_points: float = EFFECTIVE_POINTS
     effective_rays: float = EFFECTIVE_RAYS
     margin: float = MARGIN
     evaluations: Counter[int] = field(default_factory=Counter)  # of the field, by each start
@@ -178,7 +179,7 @@ class ScanProblem:
             by_place[:, 3:6] *= place.scale
             by_place[:, 6] += values * factor  # the residual is in the scan's unit
             jacobian = torch.cat([jacobian, by_place], dim=1)
-        weights = values.new_full((len(values),), EFFECTIVE_POINTS / max(len(sample.points), 1))
+        weights = values.new_full((len(values),), self.effective_points / max(len(sample.points), 1))
         weights[len(sample.points) :] = self.effective_rays / max(len(sample.until), 1)
         off = values * factor
         off[len(sample.points) : len(sample.points) + free] -= self.margin
