@@ -41,12 +41,17 @@ def _at_first(function: Any = None, *, typechecker: Any) -> Any:
     code = function.__code__  # a function within another is made anew in each call of that
     if _calls[code] >= CHECKED:
         return function
-    checked = _jaxtyped(function, typechecker=typechecker)
+    checked: Any = None
 
-    @wraps(checked)
+    @wraps(function)
     def called(*args: Any, **named: Any) -> Any:
+        nonlocal checked
         _calls[code] += 1
-        return (checked if _calls[code] <= CHECKED else function)(*args, **named)
+        if _calls[code] > CHECKED:
+            return function(*args, **named)
+        if checked is None:  # a check takes milliseconds to write, and most functions are called in few files
+            checked = _jaxtyped(function, typechecker=typechecker)
+        return checked(*args, **named)
 
     return called
 
