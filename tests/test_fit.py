@@ -20,7 +20,7 @@ from distrace.render import render
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 TRUE = torch.tensor([0.45, 0.1, -0.15, 0.05])
 PRIOR = Prior(torch.tensor([0.3, 0.0, 0.0, 0.0]), torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1])))
-CONFIG = FitConfig(iterations=120, learning_rate=0.1, starts=1, mask_rays=200)
+CONFIG = FitConfig(iterations=80, learning_rate=0.1, starts=1, mask_rays=200)
 
 
 def view_of(code: Tensor, camera: Camera = CAMERA, *, mask: bool = True, normal: bool = False) -> View:
