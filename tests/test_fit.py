@@ -20,7 +20,7 @@ from distrace.render import render
 CAMERA = Camera.orbit(30, 20, 2.5, height=40, width=40, focal_px=40.0)
 TRUE = torch.tensor([0.45, 0.1, -0.15, 0.05])
 PRIOR = Prior(torch.tensor([0.3, 0.0, 0.0, 0.0]), torch.diag(torch.tensor([0.1, 0.1, 0.1, 0.1])))
-CONFIG = FitConfig(iterations=80, learning_rate=0.1, starts=1, mask_rays=200)
+CONFIG = FitConfig(iterations=120, learning_rate=0.1, starts=1, mask_rays=200)
 
 
 def view_of(code: Tensor, camera: Camera = CAMERA, *, mask: bool = True, normal: bool = False) -> View:
@@ -42,7 +42,7 @@ def everything(view: View) -> Targets:
 
 def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> None:
     view = view_of(TRUE).sparse(100)
-    step = last(fit_shape(Spheres(), [view], PRIOR, CONFIG))
+    step = last(fit_shape(Spheres(), [view], PRIOR, replace(CONFIG, iterations=80)))
     torch.testing.assert_close(step.code, TRUE, atol=0.01, rtol=0)
     assert step.loss < 0.05
     assert step.evaluations > 0

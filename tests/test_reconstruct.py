@@ -92,7 +92,9 @@ def views() -> list[Photograph]:
 @pytest.fixture(scope="module")
 def fitted(views: list[Photograph]) -> Reconstruction:
     state = Reconstruction.fresh(SMALL, SHORT, 7, CPU)
-    list(reconstruct(views[1:], state, SHORT))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("distrace.photos.visual_hull.CELLS", 80)
+        list(reconstruct(views[1:], state, SHORT))
     return state
 
 

@@ -128,9 +128,8 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
     interrupting = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(20)"
     (tmp_path / "torch.py").write_text(interrupting)
     path = os.pathsep.join([str(tmp_path), str(Path(distrace.__file__).parents[1])])
-    attended = (
-        "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"  # shells have jobs ignore it
-    )
+    # A shell has its background jobs ignore interrupts.
+    attended = "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
     program = attended + "from distrace.cli import main; sys.argv = ['distrace', 'mesh', 'sofas']; main()"
     done = python("-c", program, PYTHONPATH=path)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "distrace: interrupted\n")
