@@ -60,7 +60,7 @@ CPU = torch.device("cpu")
 SMALL = SurfaceSpecs(
     width=32, layers=2, frequencies=3, features=4, grid=GridSpecs(levels=3, finest=32, entries=512), colour_width=32
 )
-SHORT = ReconstructConfig(steps=100, initial_steps=150, sizes=(32,), rays=256, learning_rate=5e-3, refinement_steps=30)
+SHORT = ReconstructConfig(steps=110, initial_steps=150, sizes=(32,), rays=256, learning_rate=5e-3, refinement_steps=30)
 
 
 Command = Callable[..., None]
