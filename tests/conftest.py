@@ -11,7 +11,7 @@ import pytest
 import torch
 from hypothesis import settings
 
-CHECKED = 20  # calls of each function, in a test and what is set up for it: to check all takes half of its time
+CHECKED = 5  # calls of each function, in a test and what is set up for it: to check all takes half of its time
 LONG = ("cli", "reconstruct", "fit_photos", "device", "fit_camera", "boundary", "localisation")
 
 torch.set_num_threads(1)
