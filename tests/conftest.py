@@ -12,7 +12,7 @@ import torch
 from hypothesis import settings
 
 CHECKED = 5  # calls of each function, in a test and what is set up for it: to check all takes half of its time
-LONG = ("cli", "reconstruct", "fit_photos", "device", "fit_camera", "boundary", "localisation")
+LONG = ("cli", "gradcheck", "reconstruct", "tracing", "train", "commands", "gradients", "fit_camera", "decoder", "fit")
 
 torch.set_num_threads(1)
 settings.register_profile("light", deadline=None, max_examples=12, derandomize=True)

@@ -241,6 +241,7 @@ def test_a_footprint_normal_that_forgets_a_parameter_is_found() -> None:
     assert row.verdict == "disagrees"
 
 
+@pytest.mark.slow
 def test_a_decoder_s_field_knows_its_code_and_the_decoder_stays_as_it_was() -> None:
     decoder = small_decoder()
     own = check_gradients(decoder.field(0.1 * torch.ones(4)), CAMERA, size=6)
