@@ -554,7 +554,7 @@ def test_rough_values_may_be_off_by_all_of_their_error() -> None:
     assert (end - span[0]).max() > 0.3
 
 
-@pytest.mark.parametrize("name", ["box", "sofa"])
+@pytest.mark.parametrize("name", ["box", pytest.param("sofa", marks=pytest.mark.slow)])
 def test_the_clearance_costs_no_more_than_the_render(name: str) -> None:
     counted = Counted(SOFA if name == "box" else load_model("sofas").field(0))
     with torch.no_grad():
