@@ -11,8 +11,8 @@ import pytest
 import torch
 from hypothesis import settings
 
-CHECKED = 20  # calls of each function, in a test and what is set up for it: to check all takes half of its time
-LONG = ("cli", "reconstruct", "fit_photos", "device", "fit_camera", "boundary", "localisation")
+CHECKED = 5  # calls of each function, in a test and what is set up for it: to check all takes half of its time
+LONG = ("cli", "gradcheck", "reconstruct", "tracing", "train", "commands", "gradients", "fit_camera", "decoder", "fit")
 
 torch.set_num_threads(1)
 settings.register_profile("light", deadline=None, max_examples=12, derandomize=True)
@@ -41,12 +41,17 @@ def _at_first(function: Any = None, *, typechecker: Any) -> Any:
     code = function.__code__  # a function within another is made anew in each call of that
     if _calls[code] >= CHECKED:
         return function
-    checked = _jaxtyped(function, typechecker=typechecker)
+    checked: Any = None
 
-    @wraps(checked)
+    @wraps(function)
     def called(*args: Any, **named: Any) -> Any:
+        nonlocal checked
         _calls[code] += 1
-        return (checked if _calls[code] <= CHECKED else function)(*args, **named)
+        if _calls[code] > CHECKED:
+            return function(*args, **named)
+        if checked is None:  # a check takes milliseconds to write, and most functions are called in few files
+            checked = _jaxtyped(function, typechecker=typechecker)
+        return checked(*args, **named)
 
     return called
 

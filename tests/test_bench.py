@@ -110,7 +110,8 @@ def test_naive_is_a_sample_of_rays_each_for_all_of_its_steps(table: dict[str, tu
     assert row.hits == pytest.approx(table["parallel"][0].hits, rel=0.3)
 
 
-def test_queries_are_all_that_the_field_was_asked_for() -> None:
+def test_queries_are_all_that_the_field_was_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("distrace.benchmarks.ablation.NAIVE_RAYS", 10)
     counted = Counted(SOFA)
     for case in of_field(counted, poster_view(24)):
         before = counted.evaluations
@@ -120,7 +121,8 @@ def test_queries_are_all_that_the_field_was_asked_for() -> None:
         assert (trace.setup_evaluations > 0) == (case.strategy in ("coarse_to_fine", "fast"))
 
 
-def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next() -> None:
+def test_of_a_model_there_is_what_the_original_asks_and_what_fast_asks_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("distrace.benchmarks.ablation.NAIVE_RAYS", 10)
     spheres = Model("spheres", Spheres(), torch.tensor([[0.6, 0.0, 0.0, 0.0]]), ("ball",))
     rows = {row.strategy: row for row, _ in measure(of_model(spheres, spheres.codes[0], poster_view(48)), repeats=1)}
     assert len(rows) == COUNT

@@ -33,7 +33,7 @@ def test_at_the_true_camera_little_is_apart() -> None:
 
 
 def test_from_afar_it_leads_near() -> None:
-    observed = only(view(dtype=torch.float32), "normal")
+    observed = only(view(size=48, dtype=torch.float32), "normal")
     images = Blurred.of(Still.of(shape, observed.camera.intrinsics), observed, 2.0)
     start = turned(observed.camera, 35)
     *_, last = minimise(images.residuals, start, lambda camera, x: turned_object(camera, x[:3], x[3:]), APPROACH)

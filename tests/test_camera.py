@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from inspect import unwrap
 
 import pytest
 import torch
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 from distrace.camera import Camera
 from distrace.rays import Bounds, Rays, meet_sphere
 from distrace.tracing.sphere_tracing import Trace
+from distrace.viewpoint import check_size
 
 f64 = torch.float64
 orbits = st.builds(
@@ -349,3 +351,9 @@ def test_the_focal_length_of_an_orbit_keeps_its_gradient(name: str) -> None:
     rays = camera.rays()
     (gradient,) = torch.autograd.grad(rays.directions[0, 0, 0], focal)
     assert gradient.abs() > 1e-6
+
+
+def test_sizes_that_are_no_whole_numbers_are_refused() -> None:
+    without_checks_of_types = unwrap(check_size)
+    with pytest.raises(ValueError, match=r"an image of 2\.5 × 512 pixels was given; both must be whole numbers from 1"):
+        without_checks_of_types(2.5, 512)

@@ -7,11 +7,11 @@ from pathlib import Path
 import pytest
 import torch
 from pretended import DEVICE, pretended, there
-from test_train import finished, spheres
+from test_train import save_two_spheres
 
 import distrace.cli.console
 from distrace.camera import Camera
-from distrace.checkpoints.model import load_model, save_experiment
+from distrace.checkpoints.model import load_model
 from distrace.cli import multiview, parsed, pose
 from distrace.data.observation import View
 from distrace.data.photograph import Photograph
@@ -21,7 +21,6 @@ from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.render import render
 from distrace.report import views_page
-from distrace.training.config import TrainConfig
 from experiments.baselines.deepsdf import SampleFitConfig
 from experiments.tables import methods
 from experiments.tables.methods import CLOUDS, METHODS, completed_by, observation_of
@@ -31,11 +30,7 @@ Command = Callable[..., None]
 
 @pytest.fixture(scope="module")
 def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two spheres."""
-    folder, samples = tmp_path_factory.mktemp("models") / "spheres", spheres(0.45, 0.6)
-    training = finished(samples, TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3))
-    save_experiment(folder, training.decoder, training.codes, tuple(samples.names))
-    return folder
+    return save_two_spheres(tmp_path_factory.mktemp("models") / "spheres")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from distrace.checkpoints.model import load_model, save_experiment
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
-SLOW = ("08", "10")
+SLOW = ("06", "08", "10")
 DOCUMENTS = [
     *sorted((ROOT / "docs").rglob("*.md")),
     *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "results/README.md", "experiments/README.md")),

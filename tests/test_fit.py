@@ -42,7 +42,7 @@ def everything(view: View) -> Targets:
 
 def test_a_sphere_is_recovered_from_a_hundred_depths_and_its_silhouette() -> None:
     view = view_of(TRUE).sparse(100)
-    step = last(fit_shape(Spheres(), [view], PRIOR, CONFIG))
+    step = last(fit_shape(Spheres(), [view], PRIOR, replace(CONFIG, iterations=80)))
     torch.testing.assert_close(step.code, TRUE, atol=0.01, rtol=0)
     assert step.loss < 0.05
     assert step.evaluations > 0

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -32,6 +33,7 @@ def shape(points: Tensor) -> Tensor:
     return torch.stack(bars).amin(0)
 
 
+@cache
 def view(sdf: SDF = shape, size: int = 64, dtype: torch.dtype = f64) -> View:
     camera = Camera.orbit(40, 25, 4.5, height=size, width=size, dtype=dtype)
     with torch.no_grad():

@@ -1,7 +1,5 @@
 """What Jupyter shows of results: pictures of buffers, tables of models and fits."""
 
-import subprocess
-import sys
 from io import BytesIO
 
 import numpy as np
@@ -86,11 +84,3 @@ def test_a_fit_shows_its_loss_its_cost_and_its_verdict(kind: str) -> None:
         shown = ScanFit(code, Similarity.identity(), 0.123456, verdict, {}, 1_234_567, 2.5, ())._repr_html_()
         assert "<td>doubtful: 10 % of the points lie away &amp; apart</td>" in shown
     assert all(f"<td>{fact}</td>" in shown for fact in ("0.1235", "1,234,567", "2.5"))
-
-
-def test_nothing_is_imported_until_it_is_shown() -> None:
-    code = (
-        "import sys, distrace as dt; dt.render; dt.load_model; dt.fit_code; print('distrace.notebook' in sys.modules)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "False\n"

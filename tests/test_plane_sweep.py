@@ -47,9 +47,9 @@ def photographed(sdf: SDF, cameras: list[Camera]) -> list[Photograph]:
 
 @pytest.fixture(scope="module")
 def bowl() -> list[Photograph]:
-    """Seen from its open side by six cameras."""
-    places = [(azimuth, elevation) for azimuth in (-25, 0, 25) for elevation in (-15, 15)]
-    return photographed(BOWL, [Camera.orbit(*place, 3.0, height=120, width=120, focal_px=160.0) for place in places])
+    """Seen from its open side by four cameras."""
+    places = [(azimuth, elevation) for azimuth in (-12, 12) for elevation in (-12, 12)]
+    return photographed(BOWL, [Camera.orbit(*place, 3.0, height=96, width=96, focal_px=128.0) for place in places])
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +107,7 @@ def test_initialisation_finds_a_hollow_that_no_outline_shows(bowl: list[Photogra
 def test_depths_are_used_only_where_they_lie_deep_within_the_hull(
     bowl: list[Photograph], depths: ConsistentDepths, maps: list[DepthMap], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("distrace.photos.visual_hull.CELLS", 80)
     monkeypatch.setattr("distrace.reconstruction.reconstruct.plane_sweep", lambda _: maps)
     assert len(informative_depths(bowl, visual_hull(bowl))) == len(depths)
     assert informative_depths(bowl, BOWL) is NO_DEPTHS

@@ -63,7 +63,7 @@ CPU = torch.device("cpu")
 SMALL = SurfaceSpecs(
     width=32, layers=2, frequencies=3, features=4, grid=GridSpecs(levels=3, finest=32, entries=512), colour_width=32
 )
-SHORT = ReconstructConfig(steps=150, initial_steps=200, sizes=(32,), rays=256, learning_rate=5e-3, refinement_steps=30)
+SHORT = ReconstructConfig(steps=110, initial_steps=150, sizes=(32,), rays=256, learning_rate=5e-3, refinement_steps=30)
 
 
 Command = Callable[..., None]
@@ -95,7 +95,9 @@ def views() -> list[Photograph]:
 @pytest.fixture(scope="module")
 def fitted(views: list[Photograph]) -> Reconstruction:
     state = Reconstruction.fresh(SMALL, SHORT, 7, CPU)
-    list(reconstruct(views[1:], state, SHORT))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("distrace.photos.visual_hull.CELLS", 80)
+        list(reconstruct(views[1:], state, SHORT))
     return state
 
 

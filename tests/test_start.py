@@ -1,5 +1,6 @@
 """How the package and the command line start: quickly, and without the libraries that are not used yet."""
 
+import gc
 import os
 import subprocess
 import sys
@@ -10,6 +11,7 @@ import pytest
 import distrace
 import distrace.public
 from distrace.cli import COMMANDS, Lazy
+from distrace.imports import quickly
 
 HEAVY = {
     *("trimesh", "scipy", "skimage", "PIL", "matplotlib", "plotly"),
@@ -17,7 +19,17 @@ HEAVY = {
 }
 WAITED = "import os, distrace; print(os.environ['GOMP_SPINCOUNT'])"
 NOTHING = "import distrace"
-EVERYTHING = "import distrace.public; from distrace.cli import COMMANDS; [each.loaded() for each in COMMANDS.values()]"
+EVERYTHING = "from distrace.cli import COMMANDS; [each.loaded() for each in COMMANDS.values()]"
+LISTENING = """
+import gc
+before = gc.isenabled()
+passes = []
+gc.callbacks.append(lambda phase, details: passes.append(details["generation"]))
+import distrace
+distrace.Camera
+gc.callbacks.clear()
+print(before == gc.isenabled(), 2 in passes)
+"""
 HELP = """
 import sys
 from distrace.cli import main
@@ -34,33 +46,35 @@ def python(*arguments: str, **environment: str) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
 
 
-def loaded(program: str) -> list[str]:
-    """The modules that a program loads, in their order."""
+def printed(program: str) -> list[str]:
+    """The lines that a program prints; the last has the modules that it loads, in their order."""
     done = python("-c", f"{program}\nimport sys\nprint(*sys.modules)")
     assert done.returncode == 0, done.stderr[-500:]
-    return done.stdout.splitlines()[-1].split()
-
-
-@pytest.mark.parametrize("first", ["", "gc.disable()"])
-def test_public_names_are_imported_without_garbage_collection(first: str) -> None:
-    program = f"""
-import gc
-{first}
-before = gc.isenabled()
-passes = []
-gc.callbacks.append(lambda phase, details: passes.append(details["generation"]))
-import distrace
-distrace.Camera
-gc.callbacks.clear()
-print(before == gc.isenabled(), 2 in passes)
-"""
-    assert python("-c", program).stdout.strip() == "True False"
+    return done.stdout.splitlines()
 
 
 @pytest.fixture(scope="module")
-def modules() -> list[str]:
-    """The modules that all public names and all commands load."""
-    return loaded(EVERYTHING)
+def everything() -> list[str]:
+    """What is printed where all public names, then all commands are loaded."""
+    return printed(LISTENING + EVERYTHING)
+
+
+@pytest.fixture(scope="module")
+def modules(everything: list[str]) -> list[str]:
+    return everything[-1].split()
+
+
+def test_public_names_are_imported_without_garbage_collection(everything: list[str]) -> None:
+    assert everything[0] == "True False"
+
+
+def test_garbage_collection_that_was_off_stays_off() -> None:
+    gc.disable()
+    try:
+        assert quickly("distrace.public") is distrace.public
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
 
 
 def test_threads_are_set_before_torch_reads_how_long_they_spin(modules: list[str]) -> None:
@@ -69,12 +83,12 @@ def test_threads_are_set_before_torch_reads_how_long_they_spin(modules: list[str
 
 def test_neither_public_names_nor_commands_load_heavy_libraries(modules: list[str]) -> None:
     assert {"distrace.cli.reconstruct", "distrace.cli.train", "distrace.report.scene"} <= set(modules)
-    assert HEAVY & set(modules) == set()
+    assert (HEAVY | {"distrace.notebook"}) & set(modules) == set()
 
 
 @pytest.mark.parametrize("program", [NOTHING, HELP])
 def test_importing_the_package_or_asking_for_help_loads_no_torch(program: str) -> None:
-    modules = set(loaded(program))
+    modules = set(printed(program)[-1].split())
     assert "distrace" in modules
     assert (HEAVY | {"torch", "numpy"}) & modules == set()
 
@@ -114,7 +128,10 @@ def test_ctrl_c_while_modules_are_imported_is_one_line(tmp_path: Path) -> None:
     interrupting = "import os, signal, time; os.kill(os.getpid(), signal.SIGINT); time.sleep(20)"
     (tmp_path / "torch.py").write_text(interrupting)
     path = os.pathsep.join([str(tmp_path), str(Path(distrace.__file__).parents[1])])
-    done = python("-m", "distrace", "mesh", "sofas", PYTHONPATH=path)
+    # A shell has its background jobs ignore interrupts.
+    attended = "import signal, sys\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    program = attended + "from distrace.cli import main; sys.argv = ['distrace', 'mesh', 'sofas']; main()"
+    done = python("-c", program, PYTHONPATH=path)
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "distrace: interrupted\n")
 
 

@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from itertools import islice
 from pathlib import Path
 from statistics import mean
@@ -36,6 +37,7 @@ from distrace.training.trainer import Training, TrainingStep, begin_with, bound_
 CPU = torch.device("cpu")
 SPECS = NetworkSpecs(dims=(32, 32, 32), code_length=4, latent_in=(2,), norm_layers=(0, 1, 2))
 CONFIG = TrainConfig(steps=12, samples_per_step=64)
+RADII = (0.45, 0.6)
 TINY = ("--steps", "120", "--samples-per-step", "32", "--layers", "3", "--width", "16", "--code-length", "4")
 
 
@@ -65,6 +67,19 @@ def finished(samples: Samples, config: TrainConfig) -> Training:
     for _ in train(samples, training, config):
         pass
     return training
+
+
+@cache
+def two_spheres() -> Training:
+    """Spheres of two radii, learnt in a second, once in a process."""
+    return finished(spheres(*RADII), TrainConfig(steps=300, samples_per_step=256, learning_rate=5e-3))
+
+
+def save_two_spheres(folder: Path) -> Path:
+    """Writes them as a model."""
+    training = two_spheres()
+    save_experiment(folder, training.decoder, training.codes, ("sphere0", "sphere1"))
+    return folder
 
 
 def assert_same(one: Training, other: Training) -> None:

@@ -106,11 +106,14 @@ def test_only_images_with_something_on_them_count(tmp_path: Path) -> None:
     np.testing.assert_allclose(plain[0].colours[0, 0], np.array([200, 80, 20]) / 255, atol=0.01)
 
 
-def test_a_painted_patch_covers_the_same_surface_in_colours_that_vary(tmp_path: Path) -> None:
+def test_a_painted_patch_covers_the_same_surface_in_colours_that_vary(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("experiments.clips.patches.EDGE", 0.05)
     (patch,) = placed(load_patches(stored(tmp_path, image=False)), 0.0)
     fine = mottled_patch(patch, 3)
     assert fine.area == pytest.approx(patch.area)
-    assert np.linalg.norm(fine.corners - np.roll(fine.corners, 1, axis=1), axis=-1).max() <= 0.02 + 1e-9
+    assert np.linalg.norm(fine.corners - np.roll(fine.corners, 1, axis=1), axis=-1).max() <= 0.05 + 1e-9
     assert fine.colours.std((0, 1)).min() > 0.05
 
 

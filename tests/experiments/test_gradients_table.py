@@ -56,7 +56,7 @@ def test_a_subject_counts_its_evaluations() -> None:
 
 def test_the_command_writes_the_table_and_maps(tmp_path: Path) -> None:
     save_experiment(tmp_path / "ball", ball(2, 16).decoder, torch.zeros(1, 1), ("ball",))
-    Gradients(str(tmp_path / "ball"), tmp_path / "out", size=24, repeats=1).run()
+    Gradients(str(tmp_path / "ball"), tmp_path / "out", size=16, repeats=1).run()
     content = json.loads((tmp_path / "out" / "result.json").read_text())
     assert len(content["rows"]) == COUNT
     assert {"field", "parameter", "method", "relative_error", "ratio", "pixels", "model"} <= set(content["rows"][0])

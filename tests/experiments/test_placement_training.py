@@ -8,7 +8,7 @@ import torch
 from distrace.pose import Similarity
 from experiments.networks import training
 from experiments.networks.scans import ScanMaker, TrainingScans, joined_scans
-from experiments.networks.training import VALIDATION, loss_of, trained, validated, views_of
+from experiments.networks.training import loss_of, trained, validated, views_of
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +45,9 @@ def test_an_unvaried_view_tells_the_true_size_and_distance(scans: TrainingScans)
 
 
 def test_training_makes_the_true_placements_likelier(scans: TrainingScans, monkeypatch: pytest.MonkeyPatch) -> None:
-    many = scans[torch.arange(VALIDATION + 20) % len(scans)]
+    many = scans[torch.arange(28) % len(scans)]
+    monkeypatch.setattr(training, "VALIDATION", 8)
+    monkeypatch.setattr(training, "BATCH", 16)
     monkeypatch.setattr(training, "WARM_UP", 1)
     steps = []
     network = trained(many, 15, 0, steps.append)
