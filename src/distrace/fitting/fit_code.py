@@ -14,7 +14,7 @@ from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
 from distrace.fitting.ray_sampling import Targets, drawn, pools_of
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
-from distrace.fitting.scan_residuals import MARGIN, PlacedCode, ScanProblem, ScanSample
+from distrace.fitting.scan_residuals import EFFECTIVE_POINTS, MARGIN, PlacedCode, ScanProblem, ScanSample
 from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
@@ -25,7 +25,7 @@ HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
 SOLVER = SolverConfig(damping=0.1, even=True, settled=0.0)
 MEAN_DEVIATION = 1.1  # of a code's coordinates in the last round, from the mean; more where the shape is rough
-SURFACE_POINTS = 2000.0  # what all points count together
+POINTS_ALONE = 2000.0  # what all points count together where no silhouette is known
 SILHOUETTE_RAYS = 4000.0  # what all rays of an exact silhouette count together; less where there are few
 LAST_MARGIN = 0.25  # deviations that a free ray keeps from the surface in the last round
 ROUGH = 3.0  # × the deviation, in the first round
@@ -208,6 +208,7 @@ def minimised(
     def problem_of(stage: Round) -> ScanProblem:
         sample = observed.draw(stage.points, stage.rays, random)
         deviation = (stage.deviation**2 + observed.noise**2) ** 0.5
+        has_silhouette = len(sample.until) > len(sample.points)  # rays beside those of the depths
         return ScanProblem(
             quick,
             prior,
@@ -218,7 +219,7 @@ def minimised(
             samples=stage.samples,
             moves=False,
             code_deviation=MEAN_DEVIATION * (stage.deviation / config.deviation) ** 0.5,
-            effective_points=SURFACE_POINTS,
+            effective_points=EFFECTIVE_POINTS if has_silhouette else POINTS_ALONE,
             effective_rays=SILHOUETTE_RAYS * min(1.0, len(sample.until) / max(stage.rays, 1)),
             margin=stage.margin,
         )
