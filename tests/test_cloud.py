@@ -8,7 +8,7 @@ import torch
 import trimesh
 
 from distrace.camera import Camera
-from distrace.data.cloud import Cloud, load_cloud
+from distrace.data.cloud import Cloud, load_cloud, read_points
 from distrace.errors import DoubtfulResult
 
 BALL = trimesh.creation.icosphere(subdivisions=3, radius=0.6)
@@ -116,3 +116,8 @@ def test_a_part_keeps_points_and_normals_together() -> None:
     assert part.normals is not None
     assert torch.equal(part.points, part.normals)
     assert len(part.points) == 7
+
+
+def test_a_file_of_one_point_is_read(tmp_path: Path) -> None:
+    (tmp_path / "one.xyz").write_text("0.1 0.2 0.3\n")
+    assert read_points(tmp_path / "one.xyz").tolist() == [[0.1, 0.2, 0.3]]

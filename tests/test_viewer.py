@@ -16,6 +16,7 @@ from numpy.testing import assert_allclose
 import distrace as dt
 from distrace.camera import Camera
 from distrace.checkpoints.codes import save_code
+from distrace.cli.view import check_page
 from distrace.data.cloud import Cloud
 from distrace.data.observation import View, save_view
 from distrace.data.saved_scan import save_scan
@@ -267,3 +268,10 @@ def screenshot(page) -> np.ndarray:
     from PIL import Image as Picture
 
     return np.array(Picture.open(BytesIO(page.screenshot())).convert("RGB"))
+
+
+@pytest.mark.parametrize("name", ["page", "page.png", "file/page.html"])
+def test_a_page_that_cannot_be_written_is_refused_at_once(name: str, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match=rf"^--save \S+{name} "):
+        check_page(tmp_path / name)

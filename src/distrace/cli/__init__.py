@@ -72,7 +72,7 @@ COMMANDS: Commands = {
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
 INTERRUPTED = "interrupted"
-RUNNING = f"{INTERRUPTED}; every written file is complete, and sample, train and reconstruct continue when run again"
+RESUMABLE = ("sample", "train", "reconstruct")  # commands that continue when run again
 
 
 def main() -> None:
@@ -87,7 +87,9 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
     try:
         with _leaving_at_interrupts(program):
             command = parsed(sys.argv[1:], commands, program, about)
-        interrupted = RUNNING
+        interrupted = f"{INTERRUPTED}; every written file is complete"
+        if sys.argv[1:2] and sys.argv[1] in RESUMABLE:
+            interrupted += f", and {sys.argv[1]} continues when run again"
         command.run()
         sys.stdout.flush()
     except KeyboardInterrupt:

@@ -33,6 +33,8 @@ class ViewShape:
         require("the viewer", "viser")
         if not 0 < self.port < 65536:
             raise ValueError(f"--port {self.port} was given; a number from 1 to 65535 is needed")
+        if self.save is not None:
+            check_page(self.save)
         if self.out.resolve() == Path(self.shown).resolve():
             raise ValueError(f"--out {self.out} is the folder that is shown; give another to save to")
         run = start(self.out, self.device)
@@ -48,5 +50,16 @@ class ViewShape:
             console.print(f"{viewer.address} shows {scene.title}; Ctrl-C ends it", soft_wrap=True)
             until_interrupted(viewer)
         finally:
+            if viewer.controls.saving:
+                console.print("finishing what was being saved …")
             viewer.close()
         run.finish({"shown": self.shown, "address": viewer.address})
+
+
+def check_page(path: Path) -> None:
+    """Raises `ValueError` where no page can be written to a path."""
+    if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
+        raise ValueError(f"--save {path} was given; give the name of a page, which ends in .html")
+    for folder in path.parents:
+        if folder.exists() and not folder.is_dir():
+            raise ValueError(f"--save {path} cannot be written, for {folder} is a file; give another place")

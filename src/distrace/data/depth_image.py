@@ -117,6 +117,8 @@ def _matrix(text: str) -> np.ndarray:
         fx, fy, cx, cy = map(float, parts)
         return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
     path = Path(text)
+    if "," in text and not path.exists():
+        raise ValueError(f"that is {text.count(',') + 1} numbers or words")
     if path.suffix.lower() == ".npy":
         return np.load(path, allow_pickle=False)
     content = path.read_text()

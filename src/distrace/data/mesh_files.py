@@ -33,6 +33,8 @@ def load_geometry(path: Path, **options: Any) -> Any:
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
+    if kind == "xyz" and len(path.read_text(errors="replace").splitlines()) == 1:  # trimesh takes two or more
+        return trimesh.PointCloud(np.loadtxt(path, ndmin=2)[:, :3])
     if kind not in ("obj", "off", "stl", "ply"):
         return trimesh.load(path, process=False, **options)
     content = path.read_bytes()

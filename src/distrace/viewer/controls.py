@@ -31,6 +31,7 @@ class Controls:
         self.viewer = viewer
         self.worker = ThreadPoolExecutor(max_workers=1, thread_name_prefix="distrace controls")
         self.mesh_due = Event()
+        self.saving = False
         scene = viewer.scene
         gui = viewer.server.gui
         self.title = gui.add_markdown(f"**{scene.title}**")
@@ -50,8 +51,8 @@ class Controls:
         self.message = gui.add_markdown("")
 
     def close(self) -> None:
-        """Drops what was not begun."""
-        self.worker.shutdown(wait=False, cancel_futures=True)
+        """Drops what was not begun, and waits for what was; a fit ends at its next iteration."""
+        self.worker.shutdown(wait=True, cancel_futures=True)
 
     def report(self, text: str) -> None:
         """Says how the picture was made."""
@@ -176,7 +177,11 @@ class Controls:
 
     def _save(self, event: "GuiEvent") -> None:
         self.message.content = "saving …"
-        folder = self.viewer.save(None if event.client is None else event.client.camera)
+        self.saving = True
+        try:
+            folder = self.viewer.save(None if event.client is None else event.client.camera)
+        finally:
+            self.saving = False
         self.message.content = f"wrote {folder.resolve()}"
 
 

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -43,13 +44,12 @@ def view(
         wait = not hasattr(sys, "ps1")
     if wait:
         until_interrupted(viewer)
+        viewer.close()
     return viewer
 
 
 def until_interrupted(viewer: "Viewer") -> None:
-    """Keeps a page open until Ctrl-C."""
-    try:
-        while True:
+    """Returns at Ctrl-C, or when the viewer was closed."""
+    with suppress(KeyboardInterrupt):
+        while not viewer.closed:
             time.sleep(1)
-    except KeyboardInterrupt:
-        viewer.close()

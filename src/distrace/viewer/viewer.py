@@ -83,7 +83,7 @@ class Viewer:
         return self.shown.field.scene
 
     def close(self) -> None:
-        """Stops the server and all threads; a fit ends at its next iteration."""
+        """Stops the server and all threads; a save that was begun is finished first."""
         self.closed = True
         self.controls.close()
         for view in list(self.views.values()):
