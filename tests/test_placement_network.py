@@ -106,6 +106,7 @@ def test_the_network_finds_a_chair(scan: Scan) -> None:
     assert float((guess.centre - PLACE.translation).norm()) < 0.2 * float(PLACE.scale)
 
 
+@pytest.mark.slow
 def test_a_fit_starts_at_the_guess_and_tells_how_far_it_went(scan: Scan) -> None:
     model = dt.load_model("chairs")
     network = load_placement_network("chairs")
