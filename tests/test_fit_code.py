@@ -14,7 +14,8 @@ from distrace.fields.decoder import Decoder
 from distrace.fitting.code_jacobian import derivatives
 from distrace.fitting.completing import NORMAL_OFFSET, fit_of, observed_of, signed_samples
 from distrace.fitting.fit import Step
-from distrace.fitting.fit_code import CodeFitConfig, Observed, fit_code, fit_observed, fit_points, plausible_codes
+from distrace.fitting.fit_code import CodeFitConfig, fit_code, fit_observed, fit_points, plausible_codes
+from distrace.fitting.observed import Observed
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.prior import Prior
 from distrace.render import render

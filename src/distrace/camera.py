@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -155,6 +155,21 @@ class Camera(ByValue):
         """Returns which projections lie within the image, and before the camera."""
         size = pixels.new_tensor([self.width, self.height])
         return (depths > 0) & (pixels >= 0).all(-1) & (pixels < size).all(-1)
+
+    def nearest_points(
+        self, points_world: Float[Tensor, "n 3"]
+    ) -> tuple[Int[Tensor, "height width"], Float[Tensor, "height width"]]:
+        """Returns the number of the nearest point that falls into each pixel, −1 for none, and its depth or `inf`."""
+        positions, depths = self.project(points_world)
+        shown = self.shows(positions, depths).nonzero()[:, 0]
+        column, row = positions[shown].long().unbind(-1)
+        pixel = row * self.width + column
+        nearest = depths.new_full((self.height * self.width,), math.inf)
+        nearest.scatter_reduce_(0, pixel, depths[shown], "amin")
+        number = torch.full_like(nearest, -1, dtype=torch.int64)
+        is_nearest = depths[shown] == nearest[pixel]
+        number[pixel[is_nearest]] = shown[is_nearest]
+        return number.reshape(self.height, self.width), nearest.reshape(self.height, self.width)
 
     def depth(self, distance: Float[Tensor, "*batch height width"]) -> Float[Tensor, "*batch height width"]:
         """Returns the depth z of points at a distance along each pixel's ray."""

@@ -75,6 +75,11 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], dtype: torch.d
         file.write(safetensors.torch.save(content))
 
 
+def file_in_the_way(folder: Path) -> Path | None:
+    """Returns what is a file among a folder that is to be made and those above it, or None."""
+    return next((path for path in (folder, *folder.parents) if path.exists() and not path.is_dir()), None)
+
+
 def _remove_stale_parts(path: Path) -> None:
     for part in path.parent.glob(f".{glob.escape(path.name)}.*.part"):
         process = part.name.removeprefix(f".{path.name}.").removesuffix(".part")

@@ -88,7 +88,7 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
         with _leaving_at_interrupts(program):
             command = parsed(sys.argv[1:], commands, program, about)
         interrupted = f"{INTERRUPTED}; every written file is complete"
-        if sys.argv[1:2] and sys.argv[1] in RESUMABLE:
+        if sys.argv[1] in RESUMABLE:
             interrupted += f", and {sys.argv[1]} continues when run again"
         command.run()
         sys.stdout.flush()

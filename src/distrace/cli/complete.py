@@ -14,10 +14,9 @@ from distrace.cli.completion import COMPLETED, Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
 from distrace.data.cloud import Cloud, load_cloud
-from distrace.data.depth_image import KINDS
 from distrace.data.mesh_files import load_geometry
 from distrace.data.observation import View, is_canonical, load_view
-from distrace.data.scan_inputs import CLOUDS, ScanOptions, load_scan
+from distrace.data.scan_inputs import CLOUDS, ScanOptions, assumed_up, load_scan
 from distrace.data.segmented_view import check_count
 from distrace.errors import error_context
 from distrace.fitting.fit import FitConfig
@@ -113,8 +112,7 @@ class Complete:
             scan = scan.sparse(self.points, self.seed)
             check_count(len(scan.points))
         if self.up is None:
-            axis = "about -y" if self.inputs[0].suffix.lower() in KINDS else "y"
-            console.print(f"up is taken to be {axis}; --up gives another axis")
+            console.print(f"up is taken to be {assumed_up(self.inputs)}; --up gives another axis")
         truth = None if self.reference is None else _reference(self.reference)
         model = opened_for(run, self.model)
         network = load_placement_network(self.model)

@@ -24,7 +24,7 @@ from rich.progress import (
 import distrace
 from distrace.cli import discard_output
 from distrace.errors import DoubtfulResult, error_context
-from distrace.files import save_json
+from distrace.files import file_in_the_way, save_json
 from distrace.optional import MissingLibrary
 
 QUIET = 20.0  # seconds between lines where the output is no terminal
@@ -113,9 +113,9 @@ class Run:
 
 def start(out: Path, device: str = "cpu") -> Run:
     """Makes the folder. Raises `ValueError` for an `--out` that is a file, or an unavailable device."""
-    for path in (out, *out.parents):
-        if path.exists() and not path.is_dir():
-            raise ValueError(f"--out {out} cannot be a folder, for {path} is a file; give another to write to")
+    file = file_in_the_way(out)
+    if file is not None:
+        raise ValueError(f"--out {out} cannot be a folder, for {file} is a file; give another to write to")
     out.mkdir(parents=True, exist_ok=True)
     return Run(out, chosen_device(device))
 

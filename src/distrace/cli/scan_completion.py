@@ -96,7 +96,7 @@ def _pictures(scan: Scan, mesh: "trimesh.Trimesh", place: Similarity) -> dict[st
     cameras: dict[str, Camera] = {}
     for number, view in enumerate(scan.views):
         name = "the sensor" if len(scan.views) == 1 else f"sensor {number + 1}"
-        cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, SIDE / max(view.depth.shape))).to("cpu"))
+        cameras[name] = place.camera_in_object(view.camera.resized(min(1.0, SIDE / max(view.depth.shape))))
     for name, (azimuth, elevation) in VIEWS.items():
         cameras[name] = Orbit(azimuth=azimuth, elevation=elevation, size=SIDE).camera()
     return {name: mesh_picture(mesh, camera) for name, camera in cameras.items()}

@@ -8,6 +8,7 @@ import tyro
 
 from distrace.cli.common import CodeName, default
 from distrace.cli.console import console, start
+from distrace.files import file_in_the_way
 from distrace.optional import require
 from distrace.viewer.page import until_interrupted
 from distrace.viewer.results import open_scene
@@ -60,6 +61,6 @@ def check_page(path: Path) -> None:
     """Raises `ValueError` where no page can be written to a path."""
     if path.suffix.lower() not in (".html", ".htm") or path.is_dir():
         raise ValueError(f"--save {path} was given; give the name of a page, which ends in .html")
-    for folder in path.parents:
-        if folder.exists() and not folder.is_dir():
-            raise ValueError(f"--save {path} cannot be written, for {folder} is a file; give another place")
+    file = file_in_the_way(path.parent)
+    if file is not None:
+        raise ValueError(f"--save {path} cannot be written, for {file} is a file; give another place")

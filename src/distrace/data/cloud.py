@@ -36,12 +36,7 @@ class Cloud:
 
     def seen_from(self, camera: Camera) -> View:
         """Returns the points as depths of the pixels that they fall into, the nearest of each; none hides another's."""
-        pixels, depths = camera.project(self.points)
-        shown = camera.shows(pixels, depths)
-        column, row = pixels[shown].long().unbind(-1)
-        flat = torch.full((camera.height * camera.width,), torch.inf)
-        flat.scatter_reduce_(0, row * camera.width + column, depths[shown], "amin")
-        return View(camera, flat.reshape(camera.height, camera.width))
+        return View(camera, camera.nearest_points(self.points)[1])
 
 
 def load_cloud(path: Path) -> Cloud:

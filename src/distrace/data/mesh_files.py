@@ -33,11 +33,11 @@ def load_geometry(path: Path, **options: Any) -> Any:
     import trimesh
 
     kind = path.suffix.lower().removeprefix(".")
-    if kind == "xyz" and len(path.read_text(errors="replace").splitlines()) == 1:  # trimesh takes two or more
-        return trimesh.PointCloud(np.loadtxt(path, ndmin=2)[:, :3])
-    if kind not in ("obj", "off", "stl", "ply"):
+    if kind not in ("obj", "off", "stl", "ply", "xyz"):
         return trimesh.load(path, process=False, **options)
     content = path.read_bytes()
+    if kind == "xyz" and content and b"\n" not in content.strip():  # trimesh cuts off the end of a single line
+        return trimesh.PointCloud(np.loadtxt(BytesIO(content)).reshape(-1)[:3].reshape(1, 3))
     text = len(content)
     if kind == "stl" and text == 84 + 50 * int.from_bytes(content[80:84], "little"):
         text = 0  # binary: trimesh ignores its header

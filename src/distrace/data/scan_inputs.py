@@ -56,6 +56,11 @@ def load_scan(paths: Sequence[Path], options: ScanOptions = ScanOptions()) -> Sc
     return _scan_of_images(paths, [(*read_scene(path), Up.along(options.up or "y")) for path in paths], options)
 
 
+def assumed_up(paths: Sequence[Path]) -> str:
+    """Returns which axis `load_scan` takes to point up where nobody says."""
+    return "about -y of the first camera" if _kind_of_all(paths) == DEPTH_IMAGE else "y"
+
+
 def _kind_of_all(paths: Sequence[Path]) -> str:
     """Returns what all inputs are. Raises `ValueError` where there are none, or of several kinds."""
     if not paths:

@@ -11,7 +11,8 @@ from distrace.data.cloud import Cloud
 from distrace.data.observation import View
 from distrace.fields.decoder import FAR
 from distrace.fitting.fit import FitConfig, Step, fit_shape
-from distrace.fitting.fit_code import CodeFit, CodeFitConfig, Observed, fit_observed, plausible_codes
+from distrace.fitting.fit_code import CodeFit, CodeFitConfig, fit_observed, plausible_codes
+from distrace.fitting.observed import Observed
 from distrace.fitting.rounds import Progress
 from distrace.prior import Prior, prior_of
 

@@ -1,7 +1,7 @@
 """Fits a shape's code where its placement is known, by multi-start Levenberg–Marquardt: to views, or to points."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -9,17 +9,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from distrace.data.observation import View
-from distrace.data.points import noise_of
 from distrace.fields.decoder import Decoder
 from distrace.fields.precision import fastest
-from distrace.fitting.ray_sampling import Targets, drawn, pools_of
+from distrace.fitting.observed import Observed
 from distrace.fitting.rounds import Ends, Progress, Round, run_rounds
-from distrace.fitting.scan_residuals import EFFECTIVE_POINTS, MARGIN, PlacedCode, ScanProblem, ScanSample
+from distrace.fitting.scan_residuals import EFFECTIVE_POINTS, MARGIN, PlacedCode, ScanProblem
 from distrace.fitting.solver import SolverConfig, charbonnier
 from distrace.fitting.starts import Hints, nearest_codes
 from distrace.pose import Similarity
 from distrace.prior import START_DEVIATION, Prior
-from distrace.rays import Rays
 
 HINTS = (100, 300)  # points and rays that tell which training shapes are near
 SAMPLES = 8  # on each ray in the unit sphere, about a quarter of a radius apart; the least one is refined
@@ -97,38 +95,6 @@ class CodeFit:
 
         facts = {"loss": self.loss, "evaluations": self.evaluations, "seconds": self.seconds}
         return notebook.table("CodeFit", facts)
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What a shape is fitted to: points and rays, drawn from views or from a list of points."""
-
-    draw: Callable[[int, int, torch.Generator], ScanSample]  # at most so many points and rays of each view
-    noise: float  # standard deviation of the points about the surface
-
-    @staticmethod
-    def of_views(decoder: Decoder, views: Sequence[View], prior: Prior) -> "Observed":
-        """Raises `ValueError` without views, or with one from inside the mean shape."""
-        pools = pools_of(decoder.field(prior.mean), views, prior.mean.device)
-        noise = max(noise_of(view.to("cpu").points()) for view in views)
-
-        def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
-            return _sample([pool.draw(points, rays, random) for pool in pools], 2 * noise)
-
-        return Observed(draw, noise)
-
-    @staticmethod
-    def of_points(samples: Float[Tensor, "n 4"]) -> "Observed":
-        """Takes points and their signed distances from the surface. Raises `ValueError` without points."""
-        if not len(samples):
-            raise ValueError("no points were given; fitting needs points with their signed distances")
-
-        def draw(points: int, rays: int, random: torch.Generator) -> ScanSample:
-            chosen = drawn(samples, points + rays, random)
-            none = samples[:0, :3]
-            return ScanSample(chosen[:, :3], Rays(none, none), none[:, 0], 0, chosen[:, 3])
-
-        return Observed(draw, 0.0)
 
 
 def fit_code(
@@ -229,24 +195,3 @@ def minimised(
 
 def _identity(prior: Prior) -> Similarity:
     return Similarity.identity().to(prior.mean.device)
-
-
-def _sample(targets: Sequence[Targets], before: float) -> ScanSample:
-    """Returns points at depths, rays that are free until `before` these or beside the object, and rays that meet it."""
-    points = []
-    free: list[Rays] = []
-    until = []
-    hits: list[Rays] = []
-    for target in targets:
-        rays = target.camera.rays(target.pixels)
-        distance = target.depth / target.camera.cosines(target.pixels)
-        known = distance.isfinite()
-        points.append(rays.at(distance)[known])
-        is_free = known | ~target.is_object
-        free.append(rays[is_free])
-        until.append(distance[is_free] - before)
-        hits.append(rays[target.is_object & ~known])
-    rays = Rays.cat([*free, *hits])
-    ends = torch.cat(until)
-    beyond = ends.new_full((len(rays.origins) - len(ends),), torch.inf)
-    return ScanSample(torch.cat(points), rays, torch.cat([ends, beyond]), len(ends))

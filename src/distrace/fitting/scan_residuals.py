@@ -56,10 +56,10 @@ class PlacementPrior:
     centre: Float[Tensor, "3"]
     up: Float[Tensor, "3"] | None
     size_deviation: float = GROWTH  # of the logarithm
-    centre_deviation: float = torch.inf  # in sizes, along each axis; `inf` where no network was asked
+    centre_deviation: float = torch.inf  # in sizes, along each axis; `inf` without a network
 
     def prior_deviation(self, place: Similarity) -> float | None:
-        """Returns how many deviations a placement is away, by size or centre; None where no network was asked."""
+        """Returns how many deviations a placement is away, by size or centre; None without a network."""
         if math.isinf(self.centre_deviation):
             return None
         size = abs(float((place.scale / self.size).log())) / self.size_deviation

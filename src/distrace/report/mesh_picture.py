@@ -6,7 +6,7 @@ import torch
 from torch.nn.functional import normalize
 
 from distrace.camera import Camera
-from distrace.shading import WHITE, Picture, key_light, mean_light, shaded_picture
+from distrace.shading import WHITE, Picture, mean_light, shaded_picture
 
 if TYPE_CHECKING:
     import trimesh
@@ -23,21 +23,12 @@ def mesh_picture(mesh: "trimesh.Trimesh", camera: Camera) -> Picture:
     (96, 96, 3)
     """
     fine = camera.to("cpu").float().resized(SAMPLES)
-    directions = fine.rays().directions
-    light = key_light(directions)
-    depth = torch.full((fine.height * fine.width,), torch.inf)
-    normal = torch.zeros(len(depth), 3)
     points, normals = _surface_points(mesh, fine)
-    positions, depths = fine.project(points)
-    shown = fine.shows(positions, depths)
-    column, row = positions[shown].long().unbind(-1)
-    pixel = row * fine.width + column
-    depth.scatter_reduce_(0, pixel, depths[shown], "amin")
-    is_nearest = depths[shown] == depth[pixel]
-    normal[pixel[is_nearest]] = normals[shown][is_nearest]
-    normal = normal.reshape(fine.height, fine.width, 3)
-    mask = depth.isfinite().reshape(fine.height, fine.width)
-    return mean_light(shaded_picture(normal, mask, directions, light), mask, SAMPLES, WHITE)
+    nearest, _ = fine.nearest_points(points)
+    mask = nearest >= 0
+    normal = torch.zeros(*mask.shape, 3)
+    normal[mask] = normals[nearest[mask]]
+    return mean_light(shaded_picture(normal, mask, fine.rays().directions), mask, SAMPLES, WHITE)
 
 
 def _surface_points(mesh: "trimesh.Trimesh", camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:

@@ -49,7 +49,7 @@ def view(
 
 
 def until_interrupted(viewer: "Viewer") -> None:
-    """Returns at Ctrl-C, or when the viewer was closed."""
+    """Returns at Ctrl-C."""
     with suppress(KeyboardInterrupt):
-        while not viewer.closed:
+        while True:
             time.sleep(1)
