@@ -7,10 +7,22 @@ import pytest
 
 SOURCE = Path(__file__).parents[1] / "src" / "distrace"
 ORDER = [
-    *("threads", "imports", "optional", "errors", "files", "processes", "equality", "image_cache", "pixels", "vectors"),
+    *(
+        "threads",
+        "imports",
+        "optional",
+        "errors",
+        "files",
+        "processes",
+        "equality",
+        "image_cache",
+        "pixels",
+        "vectors",
+        "colour_space",
+    ),
     *("rays", "viewpoint", "camera", "pose"),
     *("fields", "surface", "shading", "notebook", "checkpoints", "prior"),
-    *("tracing", "render", "boundary", "antialiasing", "movie", "checking"),
+    *("tracing", "render", "boundary", "lights", "coloured", "antialiasing", "movie", "checking"),
     *("losses", "metrics", "mesh", "data"),
     *("training", "fitting", "photos", "reconstruction", "viewer", "public"),
     *("report", "benchmarks", "cli", "__main__"),

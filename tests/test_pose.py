@@ -8,7 +8,18 @@ import torch
 from torch import Tensor
 
 from distrace.camera import Camera
-from distrace.pose import aimed, exp_se3, object_in_camera, pose_error, turned_object, with_object_at, zoomed
+from distrace.fields import primitives
+from distrace.pose import (
+    Similarity,
+    aimed,
+    exp_se3,
+    object_in_camera,
+    pose_error,
+    turned_object,
+    with_object_at,
+    zoomed,
+)
+from distrace.render import render
 
 f64 = torch.float64
 
@@ -87,3 +98,13 @@ def test_the_exponential_of_a_twist_is_a_screw_and_batches() -> None:
 def test_the_exponential_of_a_twist_has_the_derivatives_of_finite_differences(angle: float) -> None:
     turn = vector(angle, -angle / 2, 0).requires_grad_()
     assert torch.autograd.gradcheck(exp_se3, (turn, vector(0.1, 0.2, 0.3).requires_grad_()))
+
+
+def test_a_camera_in_the_objects_frame_keeps_the_placements_gradient() -> None:
+    seen = Camera.orbit(30, 20, 4, height=15, width=15, dtype=f64)
+    identity = Similarity(*(part.double() for part in (torch.eye(3), torch.zeros(3), torch.ones(()))))
+
+    def depths(step: Tensor) -> Tensor:
+        return render(primitives.sphere(0.5), identity.moved(step).camera_in_object(seen)).depth[6:9, 6:9]
+
+    assert torch.autograd.gradcheck(depths, (torch.zeros(7, dtype=f64, requires_grad=True),), atol=1e-5)

@@ -157,10 +157,10 @@ class Similarity(ByValue):
 
     def camera_in_object(self, camera: Camera) -> Camera:
         """Returns the camera with the same view in the object's frame; depths are divided by the scale."""
-        pose = camera.T_world_camera.clone()
-        pose[:3, :3] = self.rotation.T @ pose[:3, :3]
-        pose[:3, 3] = self.to_object(pose[:3, 3])
-        return replace(camera, T_world_camera=pose)
+        pose = camera.T_world_camera
+        rotation = self.rotation.T @ pose[:3, :3]
+        upper = torch.cat([rotation, self.to_object(pose[:3, 3])[:, None]], dim=1)
+        return replace(camera, T_world_camera=torch.cat([upper, pose[3:]]))
 
     def moved(self, step: Float[Tensor, "7"]) -> "Similarity":
         """Returns the placement after a step: rotation vector (3), shift (3) and log scale, in the world's axes.

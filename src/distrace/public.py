@@ -1,6 +1,6 @@
 """The public names, which `import distrace` offers."""
 
-from distrace import losses
+from distrace import lights, losses
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checking.gradcheck import GradientCheck, check_gradients
@@ -64,6 +64,7 @@ __all__ = [
     "fit_code",
     "fit_shape",
     "footprint_normals",
+    "lights",
     "load_model",
     "load_view",
     "losses",
