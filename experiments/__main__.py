@@ -2,6 +2,7 @@
 
 from distrace.cli import run_commands
 from experiments.commands.clip import Clip
+from experiments.commands.colours import Colours
 from experiments.commands.costs import BoundaryGradients, Fields, Gradients, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
 from experiments.commands.foreign_models import ForeignModels
@@ -34,6 +35,7 @@ COMMANDS = {
     "train-placement": TrainPlacement,
     "real-scans": RealScans,
     "multiview": Multiview,
+    "colours": Colours,
     "photographs": Photographs,
     "foreign-models": ForeignModels,
     "splits": Splits,

@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from jaxtyping import Float, UInt8
 
-from experiments.clips.patches import Patch
+from distrace.data.patches import Patch
 
 BOXES = 260
 NEAREST = 7.0  # radii from the origin; cameras are at about 5

@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from distrace.camera import Camera
+from distrace.data.patches import Patch
+from distrace.lights import Ambient, Directional, Light
 from distrace.shading import Picture
 from experiments.clips import clutter
-from experiments.clips.patches import Patch
 
 BRIGHTNESS = 0.42  # radiance of the surroundings
 LAMP_RADIANCE = 6.0
@@ -47,6 +48,23 @@ def staged(patches: Sequence[Patch], background: str, seed: int) -> Stage:
     alone = {f"patch{index}": _mesh(mi, patch) for index, patch in enumerate(patches)}
     around = {"grey": _grey()} if background == "plain" else _hall(mi, seed)
     return Stage({"type": "scene", **alone}, {"type": "scene", **alone, **around, "lamp": _lamp(mi)})
+
+
+def in_lights(patches: Sequence[Patch], lights: Sequence[Light]) -> Stage:
+    """Returns the patches in ambient and directional lights, with shadows. Raises `ValueError` for other lights."""
+    mi = mitsuba()
+    alone = {f"patch{index}": _mesh(mi, patch) for index, patch in enumerate(patches)}
+    emitters = {f"light{index}": _emitter(light) for index, light in enumerate(lights)}
+    return Stage({"type": "scene", **alone}, {"type": "scene", **alone, **emitters})
+
+
+def _emitter(light: Light) -> dict[str, Any]:
+    if isinstance(light, Ambient):
+        return {"type": "constant", "radiance": {"type": "rgb", "value": light.colour.tolist()}}
+    if isinstance(light, Directional):  # a surface that faces it reflects albedo × irradiance / π
+        irradiance = {"type": "rgb", "value": (np.pi * light.colour).tolist()}
+        return {"type": "directional", "direction": (-light.direction).tolist(), "irradiance": irradiance}
+    raise ValueError(f"{light} cannot be rendered by Mitsuba; give ambient and directional lights")
 
 
 def photograph(stage: Stage, camera: Camera, samples: int, seed: int) -> Picture:

@@ -9,8 +9,9 @@ from typing import Annotated
 import tyro
 
 from distrace.cli.console import console, progress, start
+from distrace.data.patches import Patch, load_patches, placed
 from experiments.clips import clip, mitsuba_scene
-from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
+from experiments.clips.mottled_patches import has_images, mottled_patch
 from experiments.datasets.solids import mesh_of
 from experiments.datasets.splits import Meshes
 

@@ -9,7 +9,9 @@ from jaxtyping import Float
 from torch.nn.functional import max_pool2d
 
 from distrace.camera import Camera
+from distrace.coloured import coloured_picture, studio
 from distrace.fields.base import SDF
+from distrace.fields.colour import Albedo
 from distrace.render import Buffers, Config, render, render_rays
 from distrace.shading import WHITE, Colour, Picture, Rgba, key_light, mask_picture, mean_light, shaded_picture
 from distrace.tracing.tracer import TracerConfig
@@ -20,11 +22,12 @@ QUARTERS = ((-0.25, -0.25), (0.25, -0.25), (-0.25, 0.25), (0.25, 0.25))  # pixel
 
 @dataclass(frozen=True)
 class Style:
-    """How a shape is drawn: `samples` × `samples` rays a pixel, a background, and the direction to the light."""
+    """How a shape is drawn: `samples` × `samples` rays a pixel, a background, a direction to the light, and colours."""
 
     samples: int = 1
     background: Colour | None = WHITE  # None: transparent
     light: Float[np.ndarray, "3"] | None = None  # None: over the camera's left shoulder
+    albedo: Albedo | None = None  # None: clay
 
     @torch.no_grad()
     def draw(
@@ -39,9 +42,14 @@ class Style:
         shaded: list[np.ndarray] = []
         masks: list[np.ndarray] = []
         for part in parts:
-            shaded.append(mean_light(clay_picture(part, light), part.mask, self.samples, self.background))
+            shaded.append(mean_light(self._painted(part, light), part.mask, self.samples, self.background))
             masks.append(mean_light(mask_picture(part.mask), part.mask, self.samples, WHITE))
         return np.concatenate(shaded), np.concatenate(masks)
+
+    def _painted(self, buffers: Buffers, light: Float[np.ndarray, "3"]) -> Picture:
+        if self.albedo is None:
+            return clay_picture(buffers, light)
+        return coloured_picture(buffers, self.albedo, studio(buffers, light))
 
     def _rendered(self, sdf: SDF, buffers: Buffers, camera: Camera, config: Config) -> Iterator[Buffers]:
         """Yields bands of the picture from the top, each with `samples` rays along both sides of a pixel."""

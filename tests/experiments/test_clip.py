@@ -16,11 +16,12 @@ from trimesh.visual.material import SimpleMaterial
 
 from distrace.camera import Camera
 from distrace.data.mesh_files import load_soup
+from distrace.data.patches import Patch, load_patches, placed
 from distrace.data.solid import Solid, load_solid, turned
 from experiments.__main__ import main
 from experiments.clips import clip, mitsuba_scene
 from experiments.clips.clutter import NEAREST, boxes, sky
-from experiments.clips.patches import Patch, has_images, load_patches, mottled_patch, placed
+from experiments.clips.mottled_patches import has_images, mottled_patch
 from experiments.clips.solid_texture import mottled, value_noise
 from experiments.datasets.solids import observe
 

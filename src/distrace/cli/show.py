@@ -12,6 +12,7 @@ import tyro
 from distrace.antialiasing import Style
 from distrace.camera import Camera
 from distrace.checkpoints.codes import named_code
+from distrace.checkpoints.colours import named_albedo
 from distrace.cli.common import (
     CodeName,
     Flag,
@@ -27,6 +28,7 @@ from distrace.cli.common import (
 )
 from distrace.cli.console import progress, start
 from distrace.cli.style import parsed_style
+from distrace.coloured import coloured_mesh
 from distrace.data.observation import View as Observation
 from distrace.data.observation import save_view
 from distrace.fields.base import Counted
@@ -78,6 +80,8 @@ class Render(Orbit):
     background: Annotated[str, tyro.conf.arg(metavar="white|transparent|R,G,B")] = "white"  # of shaded.png, the movie
     light: Annotated[str | None, default("over the camera's left shoulder", "AZIMUTH,ELEVATION")] = None
     """direction to the light in degrees, as the camera's"""
+    colour: Annotated[str | None, default("clay", "own|SHAPE|FILE")] = None
+    """draw shaded.png and the movie in the shape's own colours, another training shape's, or those of a colour.npy"""
     device: str = "cpu"
 
     def run(self) -> None:
@@ -90,7 +94,10 @@ class Render(Orbit):
         camera = self.camera().to(run.device)
         cameras = [camera] if self.orbit is None else turntable(camera, self.orbit)
         model = opened_for(run, self.model)
-        field = model.field(named_code(model, self.code))
+        code = named_code(model, self.code)
+        if self.colour is not None:
+            style = replace(style, albedo=named_albedo(model, self.model, self.code, code, self.colour))
+        field = model.field(code)
         counted = Counted(field)
         finer = Counted(field)  # of the further rays a pixel
         with torch.no_grad(), run.noticing():
@@ -172,15 +179,20 @@ class Mesh:
     code: CodeName = "0"
     resolution: int = 256  # cells along each side of the cube around the unit sphere
     format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
+    colour: Annotated[str | None, default("none", "own|SHAPE|FILE")] = None  # colours of the vertices, as in `render`
     device: str = "cpu"
 
     def run(self) -> None:
         check_formats(self.format)
         run = start(self.out, self.device)
         model = opened_for(run, self.model)
-        counted = Counted(model.field(named_code(model, self.code)))
+        code = named_code(model, self.code)
+        albedo = None if self.colour is None else named_albedo(model, self.model, self.code, code, self.colour)
+        counted = Counted(model.field(code))
         with run.noticing():
             surface = extract_mesh(counted, MeshConfig(self.resolution, device=run.device))
+        if albedo is not None:
+            surface = coloured_mesh(surface, albedo, run.device)
         save_meshes(run.out, surface, self.format)
         evaluations = {"evaluations": counted.evaluations, "setup_evaluations": counted.evaluations}
         run.finish({**evaluations, "faces": len(surface.faces)}, f"{len(surface.faces)} faces")

@@ -11,8 +11,9 @@ import tyro
 
 from distrace.antialiasing import clay_picture
 from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import NONE, Every, Orbit, default, opened
+from distrace.cli.common import NONE, Every, Flag, Orbit, default, opened
 from distrace.cli.console import Run, console, progress, start
+from distrace.cli.train_colours import train_colours
 from distrace.cli.train_samples import sample_files
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
@@ -22,6 +23,7 @@ from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import load_training, save_training
+from distrace.training.colours import ColourTrainConfig
 from distrace.training.config import TrainConfig
 from distrace.training.fine_tuning import Distillation, oversampled
 from distrace.training.losses import STEPS_PER_LOSS
@@ -63,6 +65,8 @@ class Train:
     width: Annotated[int | None, default(DEEPSDF["width"])] = None
     code_length: Annotated[int | None, default(DEEPSDF["code_length"])] = None
     begin_with: Annotated[str | None, default("none", "MODEL")] = None  # a model to continue training from
+    colour: Flag = False
+    """train colours for the shapes of --begin-with, which stay as they are, from a folder of textured meshes"""
     seed: Annotated[int | None, default(TrainConfig.seed)] = None
     save_every: float = 60.0  # seconds between checkpoints
     device: str = "cpu"
@@ -71,7 +75,14 @@ class Train:
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
+        if self.colour and self.begin_with is None:
+            raise ValueError("--colour was given without --begin-with, which names the model to add colours to")
         run = start(self.out, self.device)
+        if self.colour and self.begin_with is not None:
+            with run_lock(run.out), flushed_denormals(), run.noticing():
+                config = replace(ColourTrainConfig(), **_given(self, "steps", "seed"))
+                train_colours(run, self.samples, self.split, self.begin_with, config)
+            return
         with run_lock(run.out), flushed_denormals(), run.noticing():
             self._train(run, saving)
 

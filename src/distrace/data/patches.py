@@ -1,26 +1,21 @@
-"""Meshes with their appearance: images, or colours at their corners.
-
-A mesh keeps its own images where they cover enough of it. Otherwise noise modulates its colours, so that views can be
-matched.
-"""
+"""Meshes with their appearance: images, or colours at their corners."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import trimesh
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Int, UInt8
 from PIL import Image
 
 from distrace.data.ac3d import Surfaces, load_surfaces
 from distrace.data.solid import bounding, normalised_frame, turn_matrix
 from distrace.errors import error_context
-from experiments.clips.solid_texture import mottled
 
-LEAST_TEXTURED = 0.25  # share of the area under images of more than one colour
-EDGE = 0.02  # radii: triangles are split to this before their corners are coloured
+if TYPE_CHECKING:
+    import trimesh
+
 LARGEST_UV = 1e4  # repetitions of an image; garbage beyond becomes infinite in Mitsuba's filter
 GREY = np.full(3, 0.6)
 
@@ -41,6 +36,16 @@ class Patch:
     def area(self) -> float:
         return _soup([self]).area
 
+    def colours_at(self, triangle: Int[np.ndarray, "n"], weights: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+        """Returns sRGB colours at barycentric coordinates; an image repeats, and its nearest pixel counts."""
+        if self.image is None:
+            return np.einsum("nk,nkc->nc", weights, self.colours[triangle])
+        height, width = self.image.shape[:2]
+        u, v = np.einsum("nk,nkd->dn", weights, self.uv[triangle]) % 1.0
+        row = ((1 - v) * height).astype(int).clip(0, height - 1)
+        column = (u * width).astype(int).clip(0, width - 1)
+        return self.image[row, column] / 255
+
 
 def load_patches(path: Path) -> list[Patch]:
     """Returns all triangles of a file. Raises `ValueError` for a file that cannot be read."""
@@ -48,42 +53,31 @@ def load_patches(path: Path) -> list[Patch]:
         return _of_ac3d(path) if path.suffix.lower() == ".ac" else _of_trimesh(path)
 
 
-def has_images(patches: Sequence[Patch]) -> bool:
-    """Whether images cover enough of a mesh to match views."""
-    textured = sum(patch.area for patch in patches if patch.image is not None)
-    return bool(textured > LEAST_TEXTURED * sum(patch.area for patch in patches))
+def in_unit_sphere(patches: Sequence[Patch], degrees: float) -> list[Patch]:
+    """Returns the patches in the frame of their solid, turned about y."""
+    middle, scale = normalised_frame(_soup(patches))
+    rotation = turn_matrix(degrees)[:3, :3]
+    return [replace(patch, corners=(patch.corners - middle) * scale @ rotation.T) for patch in patches]
 
 
 def placed(patches: Sequence[Patch], degrees: float) -> list[Patch]:
-    """Returns the patches in the frame of `solid_of`, without the triangles that bound nothing of the solid."""
-    middle, scale = normalised_frame(_soup(patches))
-    rotation = turn_matrix(degrees)[:3, :3]
-    moved = [replace(patch, corners=(patch.corners - middle) * scale) for patch in patches]
+    """Returns the patches in the frame of their turned solid, without the triangles that bound nothing of it."""
+    moved = in_unit_sphere(patches, degrees)
     moved = [patch.chosen(_soup([patch]).area_faces > 1e-14) for patch in moved]
     masks = np.split(bounding(_soup(moved)), np.cumsum([len(patch.corners) for patch in moved])[:-1])
-    visible = (patch.chosen(mask) for patch, mask in zip(moved, masks) if mask.any())
-    return [replace(patch, corners=patch.corners @ rotation.T) for patch in visible]
+    return [patch.chosen(mask) for patch, mask in zip(moved, masks) if mask.any()]
 
 
-def mottled_patch(patch: Patch, seed: int) -> Patch:
-    """Returns the patch with noise on its colours, or on its image's mean."""
-    base = patch.colours if patch.image is None else np.broadcast_to(_mean(patch.image), patch.colours.shape)
-    corners = patch.corners.reshape(-1, 3)
-    faces = np.arange(len(corners)).reshape(-1, 3)
-    finer: Any = trimesh.remesh.subdivide_to_size(corners, faces, EDGE, max_iter=20, return_index=True)
-    vertices, split, index = finer
-    points = np.asarray(vertices)[split]
-    flat = base[index].mean(1, keepdims=True).repeat(3, axis=1)
-    colours = mottled(points.reshape(-1, 3), flat.reshape(-1, 3), seed).reshape(points.shape)
-    return Patch(points, np.zeros((*points.shape[:2], 2)), colours)
+def _soup(patches: Sequence[Patch]) -> "trimesh.Trimesh":
+    import trimesh
 
-
-def _soup(patches: Sequence[Patch]) -> trimesh.Trimesh:
     corners = np.concatenate([patch.corners for patch in patches]).reshape(-1, 3)
     return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
 
 
 def _of_trimesh(path: Path) -> list[Patch]:
+    import trimesh
+
     scene: Any = trimesh.load(path, force="scene", process=False)
     return [_of_geometry(mesh) for mesh in scene.dump()]
 
@@ -128,12 +122,12 @@ def _patch(
 ) -> Patch:
     """Replaces an image of one colour by that colour, and garbage uv by zero."""
     if image is not None and np.ptp(image.reshape(-1, 3), axis=0).max() < 8:
-        colour = _mean(image)
+        colour = mean_colour(image)
         image = None
     return Patch(corners, np.where(np.abs(uv) < LARGEST_UV, uv, 0.0), np.broadcast_to(colour, corners.shape), image)
 
 
-def _mean(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
+def mean_colour(image: UInt8[np.ndarray, "height width 3"]) -> Float[np.ndarray, "3"]:
     return image.reshape(-1, 3).mean(0) / 255
 
 

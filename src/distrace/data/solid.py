@@ -60,12 +60,21 @@ def load_solid(path: Path) -> Solid:
 
     Raises `ValueError` for a file that cannot be read, or that bounds nothing.
     """
-    with error_context(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file", path):
-        soup = oriented(normalised(load_soup(path)))
+    soup = load_oriented(path).soup
     surface = outer_surface(soup)
     if surface.area < 0.05 * soup.area:
         raise ValueError(f"{path} bounds no solid: only {surface.area / soup.area:.0%} of its faces have an inside")
     return Solid(soup, surface)
+
+
+def load_oriented(path: Path) -> Solid:
+    """The solid of a mesh file as `load_solid` gives it, but with all faces as its surface: much faster.
+
+    Raises `ValueError` for a file that cannot be read.
+    """
+    with error_context(f"{path} cannot be read as a triangle mesh; give an OBJ, PLY, STL, OFF, GLB or AC file", path):
+        soup = oriented(normalised(load_soup(path)))
+    return Solid(soup, soup)
 
 
 def turned(solid: Solid, degrees: float) -> Solid:
