@@ -13,6 +13,7 @@ EXTRAS = {
     "plotly": "report",
     "OpenEXR": "scans",
     "viser": "view",
+    "ray": "cluster",
 }
 ONLY_X86_64 = ("embreex", "pycolmap")  # have no wheels for Linux on other processors
 

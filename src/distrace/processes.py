@@ -1,25 +1,41 @@
-"""Tasks in parallel processes."""
+"""Tasks in parallel processes, of this machine or of a Ray cluster."""
 
 import os
 import signal
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
+from importlib import import_module
 from multiprocessing import get_context, parent_process
+from socket import create_connection
 from threading import Thread, current_thread, main_thread
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
+
+from distrace.optional import require
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
 
-def parallel_map(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int) -> Iterator[Result]:
+RETRIES = 3  # of a task whose machine of a cluster was lost
+CONNECT_SECONDS = 5.0  # until a cluster must answer
+
+
+def parallel_map(
+    work: Callable[[Task], Result], tasks: Sequence[Task], jobs: int, cluster: str | None = None
+) -> Iterator[Result]:
     """Yields the result of each task as it completes, from `jobs` processes of one thread each.
+
+    With the address of a Ray `cluster`, or `auto` for the one of this machine, its free cores do the tasks instead; one
+    whose machine is lost is done again elsewhere. Its machines need distrace, and the same files under the same names.
 
     If the caller stops, by Ctrl-C or otherwise, the processes are terminated: their files must be whole or absent.
     """
+    if cluster is not None:
+        yield from _on_cluster(work, tasks, cluster)
+        return
     pool = ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_begin)
     with _deaf_children():
         pending = [pool.submit(work, task) for task in tasks]
@@ -33,6 +49,39 @@ def parallel_map(work: Callable[[Task], Result], tasks: Sequence[Task], jobs: in
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def _on_cluster(work: Callable[[Task], Result], tasks: Sequence[Task], address: str) -> Iterator[Result]:
+    """Raises `ValueError` where there is no cluster, and `MissingLibrary` without Ray."""
+    require("--cluster", "ray")
+    ray: Any = import_module("ray")
+    if not ray.is_initialized():
+        try:
+            if ":" in address and "//" not in address:  # Ray tries for minutes
+                host, port = address.rsplit(":", 1)
+                create_connection((host, int(port)), CONNECT_SECONDS).close()
+            ray.init(address=address, log_to_driver=False, logging_level="error", configure_logging=False)
+        except (OSError, RuntimeError, ValueError) as error:
+            raise ValueError(
+                f"--cluster {address} was given, and no Ray cluster answers there; `ray start --head` starts one"
+            ) from error
+
+    def alone(task: Task) -> Result:
+        torch.set_num_threads(1)
+        return work(task)
+
+    remote = ray.remote(num_cpus=1, max_retries=RETRIES)(alone)
+    pending = [remote.remote(task) for task in tasks]
+    try:
+        while pending:
+            done, pending = ray.wait(pending)
+            for result in done:
+                yield ray.get(result)
+    except ray.exceptions.RayTaskError as error:
+        raise error.cause from None  # what the task raised, without the traceback of its machine
+    finally:
+        for each in pending:
+            ray.cancel(each, force=True)
 
 
 def _begin() -> None:

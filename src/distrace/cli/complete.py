@@ -1,7 +1,7 @@
 """`complete` and `demo`: a whole shape from depths or points."""
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -10,6 +10,7 @@ import numpy as np
 import tyro
 
 from distrace.cli.common import NONE, Flag, Format, ModelName, default, opened_for
+from distrace.cli.complete_folder import FolderJob, complete_each, inputs_in
 from distrace.cli.completion import COMPLETED, Task, complete
 from distrace.cli.console import Run, console, start
 from distrace.cli.scan_completion import ScanTask, complete_scan
@@ -19,6 +20,7 @@ from distrace.data.observation import View, is_canonical, load_view
 from distrace.data.scan_inputs import CLOUDS, ScanOptions, assumed_up, load_scan
 from distrace.data.segmented_view import check_count
 from distrace.errors import error_context
+from distrace.files import run_lock
 from distrace.fitting.fit import FitConfig
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.judge import Verdict
@@ -49,7 +51,8 @@ class Complete:
         Annotated[tuple[Path, ...], tyro.conf.arg(metavar="INPUT …", help_behavior_hint="(required)")]
     ]
     """depth image (16-bit PNG in mm; NPY, EXR in m), OBSERVATION.npz, or cloud (PLY, PCD, XYZ); several of one kind:
-    depth images with --poses, observations of one world, or clouds in one frame"""
+    depth images with --poses, observations of one world, or clouds in one frame; or a folder, whose files show an
+    object each"""
     out: Path = Path("out/complete")
     up: Annotated[Axis | None, default("about -y for a depth image, else y", "AXIS")] = None
     """axis of the input's frame that points up, or `unknown`"""
@@ -77,9 +80,15 @@ class Complete:
     iterations: Annotated[int | None, default("16 of lm, 150 of adam", "INT")] = None  # canonical
     starts: Annotated[int | None, default("8 of lm, 3 of adam", "INT")] = None  # canonical: of the multi-start fit
     plausible: int = 0  # canonical: number of other completions that also fit
+    jobs: Annotated[int | None, default("one a core", "INT")] = None  # processes for a folder's inputs
+    cluster: Annotated[str | None, default("this machine's cores", "auto|ADDRESS")] = None
+    """a Ray cluster that completes a folder's inputs; its machines see the same files"""
 
     def run(self) -> None:
         run = start(self.out, self.device)
+        if len(self.inputs) == 1 and self.inputs[0].is_dir():
+            self._folder(run, self.inputs[0])
+            return
         if self.plausible < 0:
             raise ValueError(f"--plausible {self.plausible} was given; it cannot be negative")
         if self.points is not None and self.points < 1:
@@ -91,6 +100,20 @@ class Complete:
         with run.noticing():
             verdict = self._canonical(run, mesh) if frame == "canonical" else self._placed(run, mesh)
         if self.strict and verdict.name == "failed":
+            sys.exit(FAILED)
+
+    def _folder(self, run: Run, folder: Path) -> None:
+        """Completes each file of a folder into a folder of its name; a second run resumes."""
+        for name in ("poses", "mask", "box", "reference"):
+            if getattr(self, name) != getattr(type(self), name):
+                raise ValueError(f"--{name} was given with the folder {folder}, whose files show an object each")
+        if self.jobs is not None and self.jobs < 1:
+            raise ValueError(f"--jobs {self.jobs} was given; at least one process is needed")
+        alone = replace(self, jobs=None, cluster=None, strict=False)
+        jobs = [FolderJob(path, replace(alone, inputs=(path,), out=run.out / path.name)) for path in inputs_in(folder)]
+        with run_lock(run.out):
+            failed = complete_each(run, jobs, self.jobs, self.cluster)
+        if self.strict and failed:
             sys.exit(FAILED)
 
     @property
