@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from distrace.cli.common import show_table
+from distrace.cli.common import Cluster, show_table
 from distrace.cli.console import progress, start
 from distrace.processes import parallel_map
 from experiments.clips.mitsuba_scene import mitsuba
@@ -25,6 +25,7 @@ class Colours:
     meshes: Meshes = Path("out")
     out: Path = Path("out/colours")
     jobs: int = 1  # processes
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         checked(self.jobs, self.shapes)
@@ -36,7 +37,7 @@ class Colours:
         trials = colour_trials(self.classes, self.shapes, self.photographs)
         results: list[tuple[ColourTrial, list[Agreement]]] = []
         with progress("colours", len(trials)) as bar:
-            for trial, agreements in parallel_map(partial(coloured, place), trials, self.jobs):
+            for trial, agreements in parallel_map(partial(coloured, place), trials, self.jobs, self.cluster):
                 results.append((trial, agreements))
                 bar.advance(f"{trial.shape}, {trial.photographs}: {agreements[0].psnr_views:.1f} dB")
         order = {trial: number for number, trial in enumerate(trials)}

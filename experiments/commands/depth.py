@@ -8,7 +8,7 @@ from statistics import median
 
 import tyro
 
-from distrace.cli.common import show_table
+from distrace.cli.common import Cluster, show_table
 from distrace.cli.console import console, progress, start
 from distrace.files import save_text
 from distrace.processes import parallel_map
@@ -43,6 +43,7 @@ class _DepthTable:
     out: Path = Path("out/evaluate")
     resolution: int = 192  # of the meshes that are compared
     jobs: int = 2  # processes
+    cluster: Cluster = None  # of Ray, instead of these processes
     device: str = "cpu"
 
     def _run(self, name: str, extra: Callable[[Place, list[Trial]], dict] = lambda place, trials: {}) -> None:
@@ -54,7 +55,7 @@ class _DepthTable:
         trials = all_trials(self.classes, self.methods, CONDITIONS[name](), self.shapes, self.views)
         results: list[Done] = []
         with progress(name, len(trials)) as bar:
-            for each in parallel_map(partial(done, place), trials, self.jobs):
+            for each in parallel_map(partial(done, place), trials, self.jobs, self.cluster):
                 results.append(each)
                 bar.advance(f"{each.trial.shape}, {each.trial.method}: {each.chamfer:.2f}")
         order = {trial: number for number, trial in enumerate(trials)}
@@ -102,7 +103,7 @@ class Focal(_DepthTable):
         usual = [trial for trial in trials if trial.focal_ratio == 1.0]
         renderings: list[Rendering] = []
         with progress("rendering at other focal lengths", len(usual)) as bar:
-            for of_trial in parallel_map(partial(renderings_of, place), usual, self.jobs):
+            for of_trial in parallel_map(partial(renderings_of, place), usual, self.jobs, self.cluster):
                 renderings += of_trial
                 bar.advance()
         rows = sorted(
@@ -122,6 +123,7 @@ class Spread:
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         checked(self.jobs, self.shapes)
@@ -131,7 +133,7 @@ class Spread:
         chosen = {category: held_out(category, self.shapes) for category in self.classes}
         with progress("spread", sum(map(len, chosen.values()))) as bar:
             for category, model in models:
-                for row in spread_rows(category, chosen[category], model, self.meshes, self.jobs):
+                for row in spread_rows(category, chosen[category], model, self.meshes, self.jobs, self.cluster):
                     rows.append(asdict(row))
                     bar.advance(f"{row.shape}: {row.correlation:.2f}")
         show_table(rows)
@@ -153,6 +155,7 @@ class Multiview:
     meshes: Meshes = Path("out")
     out: Path = Path("out/evaluate")
     jobs: int = 2  # processes
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         checked(self.jobs, None)
@@ -170,7 +173,7 @@ class Multiview:
         }
         trials = [trial for of_clip in trials_of.values() for trial in of_clip]
         with progress("multiview", len(trials)) as bar:
-            for each in parallel_map(clip_done, trials, self.jobs):
+            for each in parallel_map(clip_done, trials, self.jobs, self.cluster):
                 results.append(each)
                 bar.advance(f"{each.shape}, {each.method}: {each.chamfer:.2f}")
         results.sort(key=lambda each: (each.category, each.background, each.shape, self.methods.index(each.method)))

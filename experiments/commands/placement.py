@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from distrace.cli.common import show_table
+from distrace.cli.common import Cluster, show_table
 from distrace.cli.console import progress, start
 from distrace.processes import parallel_map
 from experiments.commands.depth import checked, paired
@@ -27,6 +27,7 @@ class Placement:
     out: Path = Path("out/evaluate")
     resolution: int = 96  # of the meshes that are compared
     jobs: int = 1  # processes; times are those of one at a time
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         checked(self.jobs, self.shapes)
@@ -51,4 +52,6 @@ class Placement:
     def _results(self, place: Place, trials: Sequence):
         """Returns the results; of one job in this process, with all of its threads."""
         work = partial(placed, place)
-        return map(work, trials) if self.jobs == 1 else parallel_map(work, trials, self.jobs)
+        if self.jobs == 1 and self.cluster is None:
+            return map(work, trials)
+        return parallel_map(work, trials, self.jobs, self.cluster)

@@ -9,7 +9,7 @@ import tyro
 
 from distrace.checkpoints.codes import save_code
 from distrace.checkpoints.model import load_model
-from distrace.cli.common import show_table
+from distrace.cli.common import Cluster, show_table
 from distrace.cli.console import progress, start
 from distrace.data.scan_inputs import ScanOptions, load_scan
 from distrace.fitting.fit_scan import ScanFitConfig, fit_scan
@@ -43,6 +43,7 @@ class RealScans:
     resolution: int = 128  # of the meshes
     seed: int = 0
     jobs: int = 1  # processes; times are those of one at a time
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         checked(self.jobs, None)
@@ -51,7 +52,8 @@ class RealScans:
         work = partial(completed, run.out, self.resolution, self.seed)
         rows = []
         with progress("real scans", len(given)) as bar:
-            for row in map(work, given) if self.jobs == 1 else parallel_map(work, given, self.jobs):
+            alone = self.jobs == 1 and self.cluster is None
+            for row in map(work, given) if alone else parallel_map(work, given, self.jobs, self.cluster):
                 rows.append(row)
                 bar.advance(f"{row['input']}: {row['verdict']}")
         names = [each.name for each in given]

@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 
 from distrace import shading
-from distrace.cli.common import ModelName, opened, show_table
+from distrace.cli.common import Cluster, ModelName, opened, show_table
 from distrace.cli.console import Run, console, progress, start
 from distrace.files import save_json, save_text
 from distrace.fitting.fit_code import CodeFitConfig
@@ -82,6 +82,7 @@ class Pose:
     out: Path = Path("out/evaluate")
     cameras: int = 50  # for each observation and each disturbance
     jobs: int = 2  # processes
+    cluster: Cluster = None  # of Ray, instead of these processes
 
     def run(self) -> None:
         run = start(self.out)
@@ -93,7 +94,7 @@ class Pose:
         done = {found.trial for found in finished}
         missing = [trial for trial in pose_table.all_trials(self.cameras) if trial not in done]
         with progress("cameras", len(missing)) as bar:
-            for found in parallel_map(partial(pose_table.found, self.model), missing, self.jobs):
+            for found in parallel_map(partial(pose_table.found, self.model), missing, self.jobs, self.cluster):
                 finished.append(found)
                 pose_table.write_trials(trials, self.model, finished)
                 bar.advance(f"{found.trial.observation}, {found.trial.disturbance}: {found.degrees:.2f}°")

@@ -31,7 +31,7 @@ from distrace.lights import Ambient, Directional, Light, SphericalHarmonics, lit
 from distrace.photos.fit_photos import KNOWN_PLACE, fit_photos
 from distrace.pose import Similarity
 from distrace.prior import prior_of
-from distrace.render import render
+from distrace.render import Buffers, render
 from distrace.shading import Picture, colour_picture, grid, save_png
 from distrace.viewpoint import orbiting
 from experiments.clips.mitsuba_scene import Stage, in_lights, photograph, truth
@@ -39,7 +39,7 @@ from experiments.datasets.solids import mesh_of
 from experiments.datasets.splits import on_side
 from experiments.tables.trials import Place, fingerprint, grouped, hash_of, read_json
 
-NEW_VIEWS = 4
+NEW_VIEWS = 2
 SIZE = 96  # pixels
 DISTANCE = 3.6  # radii: the shape fills the image
 SAMPLES = 48  # light paths a pixel
@@ -106,17 +106,18 @@ def coloured(place: Place, trial: ColourTrial) -> tuple[ColourTrial, list[Agreem
     fitted = _fitted(model, colours, true.photographs)
     agreements = []
     pictures = {}
+    views = _rendered(model, fitted[0], [view.camera for view in true.views])
     for method, shape in zip(METHODS, fitted):
-        predicted = [_picture(model, shape, view.camera, [shape.light]) for view in true.views]
-        relit = [_picture(model, shape, view.camera, true.new_light) for view in true.relit]
+        predicted = [_picture(buffers, shape, [shape.light]) for buffers in views]
+        relit = [_picture(buffers, shape, true.new_light) for buffers in views]
         scale = _brightness(relit, true.relit)
         relit = [(colour * scale, mask) for colour, mask in relit]
-        views = mean(_psnr(each, view) for each, view in zip(predicted, true.views))
+        whole = mean(_psnr(each, view) for each, view in zip(predicted, true.views))
         colour = mean(_psnr(each, view, within=True) for each, view in zip(predicted, true.views))
         light = mean(_psnr(each, view) for each, view in zip(relit, true.relit))
         relit_colour = mean(_psnr(each, view, within=True) for each, view in zip(relit, true.relit))
         iou = mean(_iou(mask, view) for (_, mask), view in zip(predicted, true.views))
-        agreements.append(Agreement(method, views, colour, light, relit_colour, iou))
+        agreements.append(Agreement(method, whole, colour, light, relit_colour, iou))
         pictures[method] = [_shown(predicted[0]), _shown(relit[0])]
     save_json(path, {"made_by": mark, "agreements": [asdict(each) for each in agreements]})
     _save_pictures(path.with_suffix(".png"), true, pictures)
@@ -226,9 +227,19 @@ def _of_one_colour(
 
 
 @torch.no_grad()
-def _picture(model: Model, shape: ColouredShape, camera: Camera, lights: Sequence[Light]) -> tuple[Tensor, Tensor]:
+def _rendered(model: Model, shape: ColouredShape, cameras: Sequence[Camera]) -> list[Buffers]:
+    """Returns what cameras see of a shape; its field is measured once."""
+    field = model.field(shape.code)
+    views: list[Buffers] = []
+    for camera in cameras:
+        occupancy = views[0].occupancy if views else None
+        views.append(render(field, shape.place.camera_in_object(camera), occupancy=occupancy))
+    return views
+
+
+@torch.no_grad()
+def _picture(buffers: Buffers, shape: ColouredShape, lights: Sequence[Light]) -> tuple[Tensor, Tensor]:
     """Returns linear colours, black where nothing is seen, and the mask; the placement is the world's own."""
-    buffers = render(model.field(shape.code), shape.place.camera_in_object(camera))
     return shade(buffers, lit(shape.albedo, lights), torch.zeros(3)), buffers.mask
 
 

@@ -39,9 +39,11 @@ class SpreadRow:
     seconds: float  # of all completions
 
 
-def spread_rows(category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int) -> Iterator[SpreadRow]:
+def spread_rows(
+    category: str, shapes: list[Shape], model: str, meshes: Path, jobs: int, cluster: str | None = None
+) -> Iterator[SpreadRow]:
     """Yields a row for each shape."""
-    return parallel_map(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs)
+    return parallel_map(partial(_row, category, model, meshes), [shape.name for shape in shapes], jobs, cluster)
 
 
 def _row(category: str, model: str, meshes: Path, name: str) -> SpreadRow:

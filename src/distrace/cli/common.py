@@ -48,6 +48,7 @@ def default(value: object, metavar: str | None = None) -> Any:
     return tyro.conf.arg(metavar=metavar or type(value).__name__.upper(), help_behavior_hint=f"(default: {value})")
 
 
+Cluster = Annotated[str | None, default("this machine's cores", "auto|ADDRESS")]  # of Ray; it sees the same files
 NONE = tyro.conf.arg(help_behavior_hint="(default: none)")  # of options that take any number of values
 
 

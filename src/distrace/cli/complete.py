@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
-from distrace.cli.common import NONE, Flag, Format, ModelName, default, opened_for
+from distrace.cli.common import NONE, Cluster, Flag, Format, ModelName, default, opened_for
 from distrace.cli.complete_folder import FolderJob, complete_each, inputs_in
 from distrace.cli.completion import COMPLETED, Task, complete
 from distrace.cli.console import Run, console, start
@@ -81,7 +81,7 @@ class Complete:
     starts: Annotated[int | None, default("8 of lm, 3 of adam", "INT")] = None  # canonical: of the multi-start fit
     plausible: int = 0  # canonical: number of other completions that also fit
     jobs: Annotated[int | None, default("one a core", "INT")] = None  # processes for a folder's inputs
-    cluster: Annotated[str | None, default("this machine's cores", "auto|ADDRESS")] = None
+    cluster: Cluster = None
     """a Ray cluster that completes a folder's inputs; its machines see the same files"""
 
     def run(self) -> None:

@@ -27,7 +27,8 @@ SHOWN = ("verdict", "loss", "chamfer", "seconds", "reason")  # of each result
 class Command(Protocol):
     """A command that completes one input."""
 
-    out: Path
+    @property
+    def out(self) -> Path: ...
 
     def run(self) -> None: ...
 
