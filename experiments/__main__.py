@@ -1,6 +1,7 @@
 """The one entry: `python -m experiments NAME`, from the repository's root."""
 
 from distrace.cli import run_commands
+from experiments.commands.cameras import CamerasTable
 from experiments.commands.clip import Clip
 from experiments.commands.costs import BoundaryGradients, Fields, Gradients, Growth, Memory, Solvers
 from experiments.commands.depth import Focal, Multiview, Noise, SparseDepth, Spread
@@ -35,6 +36,7 @@ COMMANDS = {
     "real-scans": RealScans,
     "multiview": Multiview,
     "photographs": Photographs,
+    "cameras": CamerasTable,
     "foreign-models": ForeignModels,
     "splits": Splits,
     "choices": Choices,

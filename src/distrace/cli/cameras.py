@@ -119,6 +119,7 @@ class Cameras:
         undistort(found, self.work / "images", run.out, masks if masked else None)
         with run.optional("report.html"):
             save_text(run.out / "report.html", cameras_page(found, len(pictures), run.origin))
+        need = "" if masked else f", with masks in {run.out / 'masks'} or a dark background"
         error = found.compute_mean_reprojection_error()
         points = found.num_points3D()
         run.finish(
@@ -132,7 +133,7 @@ class Cameras:
             },
             f"{len(placed)} of {len(pictures)} photographs placed",
             f"{points:,} points, mean reprojection error {error:.2f} pixels",
-            f"next: distrace reconstruct {run.out}",
+            f"next: distrace reconstruct {run.out}{need}",
         )
 
 

@@ -139,8 +139,8 @@ class Database:
                 cancellation_token=token,
             )
 
-        models = _watched(work, lambda: watch(min(placed[0], count)))
-        return max(models.values(), key=lambda model: model.num_reg_images(), default=None)
+        models = _watched(work, lambda: watch(min(placed[0], count))).values()
+        return max(models, key=lambda model: model.num_reg_images(), default=None)
 
 
 def pairs(names: Sequence[str]) -> list[tuple[str, str]]:
@@ -162,7 +162,12 @@ def with_principal_points(model: Any) -> Any:
         return model
     adjusted = pycolmap.Reconstruction(model)
     options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True, print_summary=False)
-    _watched(lambda token: pycolmap.bundle_adjustment(adjusted, options, token), lambda: None)
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in adjusted.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    adjuster = pycolmap.create_default_bundle_adjuster(options, config, adjusted)
+    _watched(lambda _: adjuster.solve(), lambda: None)
     for camera in adjusted.cameras.values():
         off = (camera.principal_point_x / camera.width - 0.5, camera.principal_point_y / camera.height - 0.5)
         if max(map(abs, off)) > MAX_OFF_CENTRE:
@@ -246,4 +251,6 @@ def _watched(work: Callable[[Any], T], watch: Callable[[], None]) -> T:
         except BaseException:
             token.cancel()
             raise
-        return future.result()
+        result = future.result()
+    watch()
+    return result
