@@ -5,10 +5,11 @@ from pathlib import Path
 
 import tyro
 
+from distrace.camera import Camera
 from distrace.cli.cameras import Cameras
 from distrace.cli.common import show_table
 from distrace.cli.console import start
-from distrace.data.photographs import load_photographs
+from distrace.data.photographs import Photographs, load_photographs
 from experiments.tables.cameras import camera_errors
 from experiments.tables.trials import read_json
 
@@ -36,7 +37,7 @@ class CamerasTable:
         Cameras(self.data / name / PHOTOGRAPHS[name], out, seed=self.seed).run()
         result = read_json(out / "result.json")
         found = load_photographs(out)
-        errors = camera_errors(*({view.name: view.source.camera for view in each.views} for each in (found, given)))
+        errors = camera_errors(_cameras(found), _cameras(given))
         figures = {key: result[key] for key in ("reprojection_error", "points", "seconds")}
         return {
             "set": name,
@@ -45,3 +46,8 @@ class CamerasTable:
             **errors.row(),
             **figures,
         }
+
+
+def _cameras(photographs: Photographs) -> dict[str, Camera]:
+    """Returns the cameras in the folder's world, by name."""
+    return {view.name: view.source.camera for view in photographs.views if view.source is not None}

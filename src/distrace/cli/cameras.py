@@ -72,10 +72,11 @@ class Cameras:
         require("finding cameras", "pycolmap")
 
     def _check_out(self) -> None:
-        """Raises `ValueError` where the folder holds what this command did not write, or the photographs."""
-        if self.source.resolve().is_relative_to(self.out.resolve()):
-            raise ValueError(f"{self.source} lies in --out {self.out}, where images are replaced; give another folder")
-        foreign = [name for name in (*WRITTEN, WORK) if (self.out / name).exists()]
+        """Raises `ValueError` where this command would replace the photographs, or what it did not write."""
+        folders = (*WRITTEN, WORK)
+        if any(self.source.resolve().is_relative_to((self.out / name).resolve()) for name in folders):
+            raise ValueError(f"{self.source} would be replaced; give another folder than --out {self.out}")
+        foreign = [name for name in folders if (self.out / name).exists()]
         if foreign and not (self.work / "input.json").is_file():
             raise ValueError(f"--out {self.out} holds {foreign[0]}/ of something else; give another folder")
 

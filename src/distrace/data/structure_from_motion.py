@@ -185,7 +185,7 @@ def upright(model: Any) -> None:
     up = -np.mean([pose[:, 1] for pose in poses], axis=0)
     if np.linalg.norm(up) < MIN_UP:
         return
-    rotation, _ = Rotation.align_vectors([[0, 1, 0]], [up])
+    rotation = Rotation.align_vectors([[0, 1, 0]], [up])[0]
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation.as_quat()), np.zeros(3)))
 
 
@@ -228,7 +228,7 @@ def _pycolmap() -> Any:
     require("finding cameras", "pycolmap")
     import pycolmap
 
-    pycolmap.logging.minloglevel = pycolmap.logging.FATAL
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
     return pycolmap
 
 

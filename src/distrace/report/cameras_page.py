@@ -24,8 +24,9 @@ def cameras_page(model: Any, photographs: int, origin: str) -> str:
     distance = np.linalg.norm(points - middle, axis=1)
     near = points[distance <= np.quantile(distance, POINTS_SHOWN)]
     size = SIZE * float(np.median(np.linalg.norm(poses[:, :, 3] - middle, axis=1)))
-    pyramids = [trimesh.Trimesh(_pyramid(pose, size), FACES, process=False) for pose in poses]
-    cameras = trimesh.util.concatenate(pyramids)
+    corners = np.concatenate([_pyramid(pose, size) for pose in poses])
+    faces = (FACES + 5 * np.arange(len(poses))[:, None, None]).reshape(-1, 3)
+    cameras = trimesh.Trimesh(corners, faces, process=False)
     lead = f"{len(poses)} of {photographs} photographs placed, with {len(points):,} points."
     lengths = Counter(point.track.length() for point in model.points3D.values())
     mean_length = sum(length * count for length, count in lengths.items()) / max(1, len(points))
