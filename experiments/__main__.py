@@ -1,6 +1,7 @@
 """The one entry: `python -m experiments NAME`, from the repository's root."""
 
 from distrace.cli import run_commands
+from experiments.commands.cameras import CamerasTable
 from experiments.commands.clip import Clip
 from experiments.commands.colours import Colours
 from experiments.commands.costs import BoundaryGradients, Fields, Gradients, Growth, Memory, Solvers
@@ -37,6 +38,7 @@ COMMANDS = {
     "multiview": Multiview,
     "colours": Colours,
     "photographs": Photographs,
+    "cameras": CamerasTable,
     "foreign-models": ForeignModels,
     "splits": Splits,
     "choices": Choices,

@@ -52,6 +52,9 @@ COMMANDS: Commands = {
         "Complete a shape from a depth image, an observation or a point cloud, wherever the object is.",
     ),
     "pose": Lazy("distrace.cli.pose", "Pose", "Find the camera of one view of a known shape."),
+    "cameras": Lazy(
+        "distrace.cli.cameras", "Cameras", "Find the cameras of photographs, or of a video, by structure from motion."
+    ),
     "multiview": Lazy(
         "distrace.cli.multiview", "Multiview", "Find a shape and its placement from photographs with known cameras."
     ),
@@ -72,7 +75,7 @@ COMMANDS: Commands = {
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
 INTERRUPTED = "interrupted"
-RESUMABLE = ("sample", "train", "reconstruct")  # commands that continue when run again
+RESUMABLE = ("sample", "train", "cameras", "reconstruct")  # commands that continue when run again
 
 
 def main() -> None:
