@@ -13,6 +13,8 @@ EXTRAS = {
     "plotly": "report",
     "OpenEXR": "scans",
     "viser": "view",
+    "huggingface_hub": "hub",
+    "tensorboard": "tensorboard",
 }
 ONLY_X86_64 = ("embreex", "pycolmap")  # have no wheels for Linux on other processors
 
