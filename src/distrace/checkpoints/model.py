@@ -1,7 +1,7 @@
 """Models on disk: DeepSDF's experiment folders, in every dialect that writers of them have used, and the bundled ones.
 
 A folder holds `specs.json`, or `config.json`, and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and
-`LatentCodes/NAME.pth` (DeepSDF's). Nothing in a file is ever run.
+`LatentCodes/NAME.pth` (DeepSDF's); or it is a run of maurock's DeepSDF. Nothing in a file is ever run.
 """
 
 import dataclasses
@@ -17,6 +17,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.checkpoints import maurock_format
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
 from distrace.checkpoints.specs_file import SPECS, read_specs, specs_path, write_specs
 from distrace.equality import ByValue, summary
@@ -151,7 +152,8 @@ def model_folder(name: str | Path) -> Path:
 
 
 def load_model(name: str | Path) -> Model:
-    """Loads a bundled model by name, any DeepSDF experiment folder, or a folder from the Hugging Face Hub.
+    """Loads a bundled model by name, or a folder: of a DeepSDF experiment, from the Hugging Face Hub, or of a run of
+    maurock's DeepSDF.
 
     Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
 
@@ -159,10 +161,15 @@ def load_model(name: str | Path) -> Model:
     Model('sofas', 657 shapes, codes=float32[657, 256], 8 × 512)
     """
     folder = model_folder(name)
-    specs, shapes = read_specs(folder)
-    ours = folder / "model.safetensors"
-    source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
     described = specs_path(folder)
+    if (folder / maurock_format.WEIGHTS).is_file() and not described.is_file():
+        described = folder / maurock_format.SETTINGS
+        specs, source, state, codes = maurock_format.read_run(folder)
+        shapes: tuple[str, ...] = ()
+    else:
+        specs, shapes = read_specs(folder)
+        ours = folder / "model.safetensors"
+        source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
     with error_context(f"{described} describes a network that cannot be"), torch.device("meta"):
         decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
     decoder = _filled(decoder, state, source, described.name)
