@@ -20,6 +20,7 @@ from spheres import Spheres
 from torch import Tensor
 
 import distrace.cli.train
+import distrace.cli.training_run
 from distrace.checkpoints.model import Model, load_model, save_experiment, save_model
 from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
@@ -447,7 +448,7 @@ def test_the_precision_that_a_stopwatch_chose_is_saved_before_the_first_step(tmp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(distrace.cli.train, "run_training", stopped)
+        patched.setattr(distrace.cli.training_run, "run_training", stopped)
         with pytest.raises(SystemExit):
             run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
     assert (checkpoint(out)["step"], checkpoint(out)["config"]["bfloat16"]) == (0, True)
@@ -511,7 +512,8 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Pa
     assert torch.equal(one["codes"], other["codes"])
     assert one["losses"] == other["losses"]
     assert_same_state(one["decoder"], other["decoder"])
-    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "ModelParameters", "LatentCodes", ".lock"}
+    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "metrics.jsonl"}
+    wanted |= {"ModelParameters", "LatentCodes", ".lock"}
     assert {path.name for path in whole.iterdir()} == wanted
     assert load_model(whole).shapes == ("sphere0", "sphere1")
 
@@ -557,7 +559,7 @@ def test_a_training_that_diverges_keeps_what_was_saved_before(tmp_path: Path, ru
     run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
     before = checkpoint(out)
     lost = lambda *given: iter([TrainingStep(4, float("nan"), 0.1)])  # noqa: E731
-    monkeypatch.setattr(distrace.cli.train, "run_training", lost)
+    monkeypatch.setattr(distrace.cli.training_run, "run_training", lost)
     with pytest.raises(SystemExit):
         run("train", samples, "--out", out, "--steps", "9")
     assert "the training has diverged at step 4" in " ".join(capsys.readouterr().err.split())

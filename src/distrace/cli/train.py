@@ -3,34 +3,27 @@
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median_high
 from typing import Annotated, Any
 
 import torch
 import tyro
 
-from distrace.antialiasing import clay_picture
-from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import NONE, Every, Orbit, default, opened
-from distrace.cli.console import Run, console, progress, start
+from distrace.checkpoints.model import Model
+from distrace.cli.common import NONE, Every, default, opened
+from distrace.cli.console import Run, console, start
+from distrace.cli.metrics_log import Log, check_log
 from distrace.cli.train_samples import sample_files
+from distrace.cli.training_run import timed, train_to_end
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
-from distrace.render import render
-from distrace.report.charts import plot_history
-from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import load_training, save_training
 from distrace.training.config import TrainConfig
 from distrace.training.fine_tuning import Distillation, oversampled
-from distrace.training.losses import STEPS_PER_LOSS
 from distrace.training.trainer import Training, begin_with, faster_in_bfloat16, start_training
-from distrace.training.trainer import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
-TRIAL_STEPS = 20  # timed to choose the steps for --minutes
-PREVIEWED = 5  # shapes
 
 
 @dataclass(frozen=True)
@@ -65,12 +58,14 @@ class Train:
     begin_with: Annotated[str | None, default("none", "MODEL")] = None  # a model to continue training from
     seed: Annotated[int | None, default(TrainConfig.seed)] = None
     save_every: float = 60.0  # seconds between checkpoints
+    log: Log = "none"  # beside metrics.jsonl, write event files to OUT/tensorboard
     device: str = "cpu"
 
     def run(self) -> None:
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
+        check_log(self.log)
         run = start(self.out, self.device)
         with run_lock(run.out), flushed_denormals(), run.noticing():
             self._train(run, saving)
@@ -94,7 +89,7 @@ class Train:
         if initial is not None and config.dwell > 1:
             console.print(f"finding samples whose sign {initial.name} has wrong")
             loaded = oversampled(loaded, initial, config.dwell)
-        loss = _run(run, loaded, training, config, distillation, saving)
+        loss = train_to_end(run, loaded, training, config, distillation, saving, self.log)
         facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
         run.finish({**facts, "losses": training.losses})
 
@@ -132,7 +127,7 @@ class Train:
         if initial is not None:
             begin_with(training, samples.names, initial)
         if self.minutes is not None:
-            config = _timed(self.minutes, samples, specs, config, distillation, device)
+            config = timed(self.minutes, samples, specs, config, distillation, device)
         return training, config
 
     def _distillation(self, config: TrainConfig, initial: Model | None, names: list[str]) -> Distillation | None:
@@ -171,64 +166,3 @@ class Train:
 def _given(command: Train, *names: str) -> dict[str, Any]:
     """Returns the options that were given."""
     return {name: getattr(command, name) for name in names if getattr(command, name) is not None}
-
-
-def _timed(
-    minutes: float,
-    samples: Samples,
-    specs: NetworkSpecs,
-    config: TrainConfig,
-    distillation: Distillation | None,
-    device: torch.device,
-) -> TrainConfig:
-    """Returns the configuration with the steps that fit into the time, by the median of a few trial steps."""
-    trial = start_training(len(samples.names), specs, config, device)
-    steps = run_training(samples, trial, replace(config, steps=TRIAL_STEPS), distillation)
-    seconds = median_high(step.seconds for step in steps)
-    return replace(config, steps=max(int(minutes * 60 / seconds), TRIAL_STEPS))
-
-
-def _run(
-    run: Run,
-    samples: Samples,
-    training: Training,
-    config: TrainConfig,
-    distillation: Distillation | None,
-    saving: Every,
-) -> float:
-    """Trains to the last step and saves checkpoints; returns the mean loss of the last steps."""
-    loss = training.losses[-1] if training.losses else math.nan
-    with progress("training", config.steps) as bar:
-        for step in run_training(samples, training, config, distillation):
-            if not math.isfinite(step.loss):
-                raise ValueError(
-                    f"the training has diverged at step {step.step}; {run.out} has the last checkpoint; lower"
-                    " --learning-rate or --wrong-sign, or look for wrong samples"
-                )
-            loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
-            bar.advance(f"loss {loss:.5f}", to=step.step)
-            if saving.passed():
-                _save(run, samples, training, config, distillation)
-    _save(run, samples, training, config, distillation)
-    return loss
-
-
-def _save(
-    run: Run, samples: Samples, training: Training, config: TrainConfig, distillation: Distillation | None
-) -> None:
-    """Writes the checkpoint, the model in DeepSDF's layout, the loss history, and previews of a few shapes."""
-    save_training(run.out, training, config, samples.names)
-    with run.optional("losses.png"):
-        plot_history(
-            run.out / "losses.png", training.losses, STEPS_PER_LOSS, "steps", f"mean loss of {STEPS_PER_LOSS} steps"
-        )
-    others = distillation.others if distillation else {}
-    codes = torch.stack([*training.codes.detach(), *others.values()])
-    model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
-    save_experiment(run.out, model.decoder, model.codes, model.shapes)
-    training.decoder.eval()
-    camera = Orbit(size=128).camera().to(run.device)
-    numbers = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
-    with torch.no_grad():
-        pictures = [clay_picture(render(model.field(number), camera)) for number in numbers]
-    save_png(run.out / "preview.png", side_by_side(pictures))
