@@ -1,4 +1,4 @@
-"""How a run goes: `metrics.jsonl`, a JSON object a line, and with `--log tensorboard` also TensorBoard's event files."""
+"""How a run goes: `metrics.jsonl`, a JSON object a line; `--log tensorboard` also writes event files."""
 
 import json
 import math
