@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,15 +72,13 @@ class Train:
         saving = Every(self.save_every)
         check_log(self.log)
         run = start(self.out, self.device)
-        with joined(run.device) as (processes, run.device), flushed_denormals():
-            if processes.leads:
-                with run_lock(run.out), run.noticing():
-                    self._train(run, processes, saving)
-            else:
+        with joined(run.device) as (processes, run.device), flushed_denormals(), ExitStack() as stack:
+            processes.from_leader(lambda: stack.enter_context(run_lock(run.out)))
+            stack.enter_context(run.noticing())
+            if not processes.leads:
                 console.quiet = True
-                with warnings.catch_warnings():
-                    warnings.simplefilter("ignore")
-                    self._train(run, processes, saving)
+                warnings.simplefilter("ignore")
+            self._train(run, processes, saving)
 
     def _train(self, run: Run, processes: Processes, saving: Every) -> None:
         samples = self._samples(run, processes)

@@ -6,6 +6,7 @@ shares, but here shares differ from step to step and can be empty. A single proc
 """
 
 import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -62,11 +63,25 @@ class Processes:
         return total[0]
 
     def from_leader(self, make: Callable[[], Value]) -> Value:
-        """Returns in every process what `make` returns in the leader; the others do not call it."""
+        """Returns in every process what `make` returns in the leader; the others do not call it.
+
+        Where it raises, the leader raises that, and the others end: one sentence on the screen is enough.
+        """
         if self.size == 1:
             return make()
-        values: list[Any] = [make() if self.leads else None]
+        error = None
+        values: list[Any] = [None, False]
+        if self.leads:
+            try:
+                values = [make(), False]
+            except Exception as caught:
+                error = caught
+                values = [None, True]
         dist.broadcast_object_list(values)
+        if error is not None:
+            raise error
+        if values[1]:
+            sys.exit(2)
         return values[0]
 
     def wait(self) -> None:
