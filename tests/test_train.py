@@ -253,7 +253,9 @@ def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> Non
         before, after = getattr(samples, side).parts, getattr(dwelt, side).parts
         times = torch.tensor([(after[0] == sample).all(-1).sum() for sample in before[0]])
         assert set(times.tolist()) == {1, 5}
-        assert all(after[other] is before[other] for other in (1, 2)), "a variant, and what the model does not know"
+        assert all(torch.equal(after[other], before[other]) for other in (1, 2)), (
+            "a variant, and what the model does not know"
+        )
         radii[side] = before[0][:, :3].norm(dim=-1)
         radii[side, 5] = radii[side][times == 5]
     assert 0.5 <= radii["outside", 5].min() <= radii["outside", 5].max() < 0.5 + REACH
