@@ -420,6 +420,10 @@ def test_the_command_writes_a_mesh_in_the_folders_world(
     run(tmp_path / "views", "--out", out, *few, "--resolution", 32, "--held-out", 4, "--format", "ply", "obj")
     wanted = {"mesh.ply", "mesh.obj", "report.html", "result.json", "config.json", "checkpoint.pt", "forming.gif"}
     assert wanted <= {path.name for path in out.iterdir()}
+    lines = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert [line["step"] for line in lines] == [30, 35]
+    assert {"seconds", "loss", "learning_rate", "colour", "patches", "outline", "eikonal"} <= lines[0].keys()
+    assert lines[0]["loss"] > lines[0]["colour"]
     result = json.loads((out / "result.json").read_text())
     assert result["rows"][0]["views_held_out"] == 2
     assert result["rows"][0]["method"] == "ours"

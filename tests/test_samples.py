@@ -97,8 +97,8 @@ def test_a_file_of_samples_holds_the_outside_and_the_inside_apart(of_cube: np.nd
     assert min(len(pos), len(neg)) > COUNT / 4
     assert pos[:, 3].min() >= 0 > neg[:, 3].max()
     loaded = load_samples([tmp_path / "cube.npz"])
-    np.testing.assert_array_equal(loaded.inside[0].numpy(), neg)
-    np.testing.assert_array_equal(loaded.outside[0].numpy(), pos)
+    np.testing.assert_array_equal(loaded.inside.parts[0].numpy(), neg)
+    np.testing.assert_array_equal(loaded.outside.parts[0].numpy(), pos)
 
 
 def canopy(width: float) -> trimesh.Trimesh:

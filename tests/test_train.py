@@ -20,6 +20,7 @@ from spheres import Spheres
 from torch import Tensor
 
 import distrace.cli.train
+import distrace.cli.training_run
 from distrace.checkpoints.model import Model, load_model, save_experiment, save_model
 from distrace.cli import main, train_samples
 from distrace.data.samples import write_samples
@@ -27,7 +28,7 @@ from distrace.errors import DoubtfulResult
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
 from distrace.threads import flushed_denormals
-from distrace.training.batches import Samples, load_samples
+from distrace.training.batches import Samples, Side, load_samples
 from distrace.training.checkpointing import NAME, load_training, save_training
 from distrace.training.config import TrainConfig
 from distrace.training.fine_tuning import CERTAIN, REACH, Distillation, oversampled
@@ -53,7 +54,8 @@ def of_sphere(radius: float, count: int = 3000, seed: int = 0) -> np.ndarray:
 def spheres(*radii: float) -> Samples:
     parts = [torch.from_numpy(of_sphere(radius)).float() for radius in radii]
     names = [f"sphere{number}" for number in range(len(radii))]
-    return Samples(names, [part[part[:, 3] >= 0] for part in parts], [part[part[:, 3] < 0] for part in parts])
+    outside = Side.of([part[part[:, 3] >= 0] for part in parts])
+    return Samples(names, outside, Side.of([part[part[:, 3] < 0] for part in parts]))
 
 
 def sample_files(folder: Path, *radii: float) -> Path:
@@ -130,7 +132,9 @@ def test_two_spheres_get_codes_of_their_own() -> None:
 
 def test_a_draw_takes_as_many_samples_inside_as_outside_of_every_shape() -> None:
     torch.manual_seed(0)
-    shapes, batch = spheres(0.3, 0.6, 0.5).drawn(shapes=2, samples=64, variants=1.0)
+    samples = spheres(0.3, 0.6, 0.5)
+    shapes, rows = samples.draw(shapes=2, samples=64, variants=1.0)
+    batch = samples.at(rows)
     assert len(set(shapes.tolist())) == 2
     assert batch.shape == (2, 32, 4)
     assert ((batch[..., 3] < 0).sum(1) == 16).all()
@@ -213,7 +217,7 @@ def test_a_trained_folder_opens_as_a_model(tmp_path: Path) -> None:
     save_experiment(tmp_path, training.decoder, training.codes, tuple(samples.names))
     model = load_model(tmp_path)
     assert model.shapes == ("sphere0", "sphere1")
-    points = samples.outside[0][:50, :3]
+    points = samples.outside.parts[0][:50, :3]
     with torch.no_grad():
         for number, code in enumerate(training.codes):
             torch.testing.assert_close(model.field(number)(points), training.decoder.field(code)(points))
@@ -223,7 +227,7 @@ def test_what_a_model_knows_is_where_another_training_begins(tmp_path: Path) -> 
     first = finished(samples := spheres(0.3, 0.6), CONFIG)
     save_experiment(tmp_path / "trained", first.decoder, first.codes, tuple(samples.names))
     save_model(tmp_path / "bundled", model := load_model(tmp_path / "trained"))  # without weight norm
-    points = samples.outside[0][:50, :3]
+    points = samples.outside.parts[0][:50, :3]
     for name in ("trained", "bundled"):
         second = start_training(4, SPECS, CONFIG, CPU)
         begin_with(second, ["sphere1", "new", "sphere0", "sphere0~warped1"], load_model(tmp_path / name))
@@ -246,10 +250,12 @@ def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> Non
     dwelt = oversampled(samples, model, 5)
     radii = {}
     for side in ("outside", "inside"):
-        before, after = getattr(samples, side), getattr(dwelt, side)
+        before, after = getattr(samples, side).parts, getattr(dwelt, side).parts
         times = torch.tensor([(after[0] == sample).all(-1).sum() for sample in before[0]])
         assert set(times.tolist()) == {1, 5}
-        assert all(after[other] is before[other] for other in (1, 2)), "a variant, and what the model does not know"
+        assert all(torch.equal(after[other], before[other]) for other in (1, 2)), (
+            "a variant, and what the model does not know"
+        )
         radii[side] = before[0][:, :3].norm(dim=-1)
         radii[side, 5] = radii[side][times == 5]
     assert 0.5 <= radii["outside", 5].min() <= radii["outside", 5].max() < 0.5 + REACH
@@ -261,8 +267,8 @@ def test_a_model_is_learnt_further_from_both_sides_of_where_it_is_wrong() -> Non
 def test_a_model_that_is_right_leaves_the_samples_as_they_are() -> None:
     samples = spheres(0.5)
     dwelt = oversampled(samples, Model("balls", Spheres(), torch.tensor([[0.5, 0, 0, 0]]), ("sphere0",)), 5)
-    assert torch.equal(dwelt.outside[0], samples.outside[0])
-    assert torch.equal(dwelt.inside[0], samples.inside[0])
+    assert torch.equal(dwelt.outside.parts[0], samples.outside.parts[0])
+    assert torch.equal(dwelt.inside.parts[0], samples.inside.parts[0])
 
 
 def test_a_run_goes_on_at_the_rate_that_is_given(tmp_path: Path) -> None:
@@ -412,17 +418,17 @@ def test_rows_of_nan_are_dropped_and_counted(tmp_path: Path) -> None:
     np.savez(tmp_path / "ball.npz", pos=pos, neg=neg)
     with pytest.warns(DoubtfulResult, match="^3 samples that are not finite were dropped$"):
         loaded = load_samples([tmp_path / "ball.npz"])
-    assert torch.equal(loaded.outside[0], torch.from_numpy(np.delete(pos, 3, axis=0)))
-    assert torch.equal(loaded.inside[0], torch.from_numpy(neg[2:]))
+    assert torch.equal(loaded.outside.parts[0], torch.from_numpy(np.delete(pos, 3, axis=0)))
+    assert torch.equal(loaded.inside.parts[0], torch.from_numpy(neg[2:]))
 
 
 def test_samples_count_by_their_sign_on_whichever_side_they_are_stored(tmp_path: Path) -> None:
     samples = of_sphere(0.5).astype(np.float32)
     np.savez(tmp_path / "ball.npz", pos=samples[:2000], neg=samples[2000:])
     loaded = load_samples([tmp_path / "ball.npz"])
-    assert (loaded.outside[0][:, 3] >= 0).all()
-    assert (loaded.inside[0][:, 3] < 0).all()
-    assert len(loaded.outside[0]) + len(loaded.inside[0]) == len(samples)
+    assert (loaded.outside.parts[0][:, 3] >= 0).all()
+    assert (loaded.inside.parts[0][:, 3] < 0).all()
+    assert len(loaded.outside.parts[0]) + len(loaded.inside.parts[0]) == len(samples)
 
 
 @pytest.mark.parametrize("below", ["SdfSamples", ".", "SdfSamples/ShapeNet"])
@@ -447,7 +453,7 @@ def test_the_precision_that_a_stopwatch_chose_is_saved_before_the_first_step(tmp
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patched:
-        patched.setattr(distrace.cli.train, "run_training", stopped)
+        patched.setattr(distrace.cli.training_run, "run_training", stopped)
         with pytest.raises(SystemExit):
             run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
     assert (checkpoint(out)["step"], checkpoint(out)["config"]["bfloat16"]) == (0, True)
@@ -511,7 +517,8 @@ def test_a_killed_run_goes_on_and_ends_like_one_that_was_not_killed(tmp_path: Pa
     assert torch.equal(one["codes"], other["codes"])
     assert one["losses"] == other["losses"]
     assert_same_state(one["decoder"], other["decoder"])
-    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "ModelParameters", "LatentCodes", ".lock"}
+    wanted = {"result.json", "specs.json", NAME, "preview.png", "losses.png", "metrics.jsonl"}
+    wanted |= {"ModelParameters", "LatentCodes", ".lock"}
     assert {path.name for path in whole.iterdir()} == wanted
     assert load_model(whole).shapes == ("sphere0", "sphere1")
 
@@ -557,7 +564,7 @@ def test_a_training_that_diverges_keeps_what_was_saved_before(tmp_path: Path, ru
     run("train", samples, "--out", out, *TINY[2:], "--steps", "3")
     before = checkpoint(out)
     lost = lambda *given: iter([TrainingStep(4, float("nan"), 0.1)])  # noqa: E731
-    monkeypatch.setattr(distrace.cli.train, "run_training", lost)
+    monkeypatch.setattr(distrace.cli.training_run, "run_training", lost)
     with pytest.raises(SystemExit):
         run("train", samples, "--out", out, "--steps", "9")
     assert "the training has diverged at step 4" in " ".join(capsys.readouterr().err.split())

@@ -14,6 +14,8 @@ EXTRAS = {
     "OpenEXR": "scans",
     "viser": "view",
     "ray": "cluster",
+    "huggingface_hub": "hub",
+    "tensorboard": "tensorboard",
 }
 ONLY_X86_64 = ("embreex", "pycolmap")  # have no wheels for Linux on other processors
 

@@ -42,25 +42,32 @@ def read_weights(folder: Path) -> tuple[Path, dict[str, Tensor], Float[Tensor, "
     """
     weights = _checkpoint(folder / "ModelParameters")
     with error_context(f"{weights} is not a DeepSDF checkpoint with the key model_state_dict", weights):
-        stored = _unpickled(weights)["model_state_dict"]
-        state = {_modern(key): _tensor(value).float() for key, value in stored.items() if BESIDE not in key}
+        stored = read_tensors(weights)["model_state_dict"]
+        state = {modern_name(key): _tensor(value).float() for key, value in stored.items() if BESIDE not in key}
     latent = folder / "LatentCodes" / weights.name
     if not latent.is_file():
         warnings.warn(f"{latent} is missing: the model has a decoder, and no codes", DoubtfulResult, stacklevel=3)
         return weights, state, None
     with error_context(f"{latent} is not a file of DeepSDF codes with the key latent_codes", latent):
-        codes = _codes(_unpickled(latent))
+        codes = _codes(read_tensors(latent))
     return weights, state, codes
 
 
-def _unpickled(path: Path) -> dict:
-    """A file of tensors, and nothing that a pickle could run."""
+def read_tensors(path: Path) -> dict:
+    """Returns what `torch.save` wrote, if it is tensors, and nothing that a pickle could run."""
     try:
         with warnings.catch_warnings(), torch.serialization.safe_globals(NUMPY):
             warnings.simplefilter("ignore")
             return torch.load(path, map_location="cpu", weights_only=True)
     except (pickle.UnpicklingError, KeyError):
         raise ValueError("it holds something else than tensors; nothing in it was run") from None
+
+
+def modern_name(key: str) -> str:
+    """Returns the name that our decoders have for a parameter."""
+    key = re.sub(r"\b(module|_orig_mod)\.", "", key)  # DataParallel and torch.compile wrap modules at any depth
+    key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
+    return re.sub(r"weight_v$", "parametrizations.weight.original1", key)
 
 
 def _checkpoint(folder: Path) -> Path:
@@ -90,9 +97,3 @@ def _tensor(value: Tensor | np.ndarray) -> Tensor:
 def _classic(key: str) -> str:
     key = key.replace("parametrizations.weight.original0", "weight_g")
     return "module." + key.replace("parametrizations.weight.original1", "weight_v")
-
-
-def _modern(key: str) -> str:
-    key = re.sub(r"\b(module|_orig_mod)\.", "", key)  # DataParallel and torch.compile wrap modules at any depth
-    key = re.sub(r"weight_g$", "parametrizations.weight.original0", key)
-    return re.sub(r"weight_v$", "parametrizations.weight.original1", key)

@@ -1,12 +1,12 @@
 """Models on disk: DeepSDF's experiment folders, in every dialect that writers of them have used, and the bundled ones.
 
-A folder holds `specs.json` and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and
-`LatentCodes/NAME.pth` (DeepSDF's). Nothing in a file is ever run.
+A folder holds `specs.json`, or `config.json`, and either `model.safetensors` (ours) or `ModelParameters/NAME.pth` and
+`LatentCodes/NAME.pth` (DeepSDF's); or it is a run of maurock's DeepSDF. Nothing in a file is ever run.
 """
 
-import json
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import overload
@@ -17,13 +17,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.checkpoints import maurock_format
 from distrace.checkpoints.deepsdf_format import read_weights, write_weights
+from distrace.checkpoints.specs_file import SPECS, read_specs, specs_path, write_specs
 from distrace.equality import ByValue, summary
 from distrace.errors import error_context
 from distrace.fields.base import SDF
 from distrace.fields.batch import BatchField
-from distrace.fields.decoder import Decoder, NetworkSpecs, ShapeField
-from distrace.files import save_json, save_tensors
+from distrace.fields.decoder import Decoder, ShapeField
+from distrace.files import save_tensors
 
 BUNDLED = Path(__file__).parents[1] / "models"
 VARIANT = "~"  # separates a shape's name from that of its mirrored or warped variant
@@ -40,6 +42,7 @@ class Model(ByValue):
     decoder: Decoder
     codes: Float[Tensor, "shapes length"]
     shapes: tuple[str, ...]
+    folder: Path | None = dataclasses.field(default=None, compare=False, repr=False)  # that it was loaded from
 
     @overload
     def field(self, code: int) -> ShapeField: ...
@@ -90,7 +93,44 @@ class Model(ByValue):
         return torch.stack([code_of.get(shape, code_of.get(original(shape), mean)) for shape in shapes])
 
     def to(self, device: torch.device | str) -> "Model":
-        return Model(self.name, self.decoder.to(device), self.codes.to(device), self.shapes)
+        return replace(self, decoder=self.decoder.to(device), codes=self.codes.to(device))
+
+    @staticmethod
+    def from_pretrained(
+        name: str | Path, *, download: bool = False, revision: str | None = None, cache: Path | None = None
+    ) -> "Model":
+        """Loads a folder or a bundled model as `load_model` does, or a repository `owner/name` of the Hugging Face Hub.
+
+        A repository is read from the local cache (`cache`, or the Hub's own); only `download=True` uses the network.
+        Only safetensors and JSON are read. Raises `ValueError`, in one sentence, for anything that cannot be loaded.
+
+        >>> Model.from_pretrained("sofas").name
+        'sofas'
+        """
+        from distrace.checkpoints import hub
+
+        return hub.from_pretrained(name, download, revision, cache)
+
+    def save_pretrained(self, folder: str | Path, *, licence: str = "unknown", trained_on: str = "") -> None:
+        """Writes `config.json`, `model.safetensors` (in half precision) and a model card, `README.md`.
+
+        The card says what the model was trained on: `trained_on`, or what the folder that it was loaded from says.
+        Raises `ValueError` for a folder that holds a DeepSDF experiment, or a licence that is no identifier.
+        """
+        from distrace.checkpoints import hub
+
+        hub.save_pretrained(self, Path(folder), licence, trained_on)
+
+    def push_to_hub(
+        self, repository: str, *, licence: str = "unknown", trained_on: str = "", private: bool = False
+    ) -> str:
+        """Uploads what `save_pretrained` writes to `owner/name` on the Hugging Face Hub; returns the commit's address.
+
+        The repository is made where there is none. `hf auth login`, or HF_TOKEN, says who you are.
+        """
+        from distrace.checkpoints import hub
+
+        return hub.push_to_hub(self, repository, licence, trained_on, private)
 
 
 def original(shape: str) -> str:
@@ -112,7 +152,8 @@ def model_folder(name: str | Path) -> Path:
 
 
 def load_model(name: str | Path) -> Model:
-    """Loads a bundled model by name, or any DeepSDF experiment folder.
+    """Loads a bundled model by name, or a folder: of a DeepSDF experiment, from the Hugging Face Hub, or of a run of
+    maurock's DeepSDF.
 
     Raises `ValueError`, in one sentence, for whatever is missing, of another architecture, damaged or not finite.
 
@@ -120,18 +161,24 @@ def load_model(name: str | Path) -> Model:
     Model('sofas', 657 shapes, codes=float32[657, 256], 8 × 512)
     """
     folder = model_folder(name)
-    specs, shapes = _read_specs(folder)
-    ours = folder / "model.safetensors"
-    source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
-    with error_context(f"{folder / 'specs.json'} describes a network that cannot be"), torch.device("meta"):
+    described = specs_path(folder)
+    if (folder / maurock_format.WEIGHTS).is_file() and not described.is_file():
+        described = folder / maurock_format.SETTINGS
+        specs, source, state, codes = maurock_format.read_run(folder)
+        shapes: tuple[str, ...] = ()
+    else:
+        specs, shapes = read_specs(folder)
+        ours = folder / "model.safetensors"
+        source, state, codes = _read_safetensors(ours) if ours.exists() else read_weights(folder)
+    with error_context(f"{described} describes a network that cannot be"), torch.device("meta"):
         decoder = Decoder(specs)  # on meta: the sizes are only believed once the file has weights of them
-    decoder = _filled(decoder, state, source)
+    decoder = _filled(decoder, state, source, described.name)
     if codes is None:
         codes = torch.empty(0, specs.code_length)
     else:
-        _check_codes(codes, specs, folder)
+        _check_codes(codes, specs.code_length, folder, described.name)
     names = shapes if len(shapes) == len(codes) else tuple(str(number) for number in range(len(codes)))
-    return Model(folder.name, decoder.eval().requires_grad_(False), codes, names)
+    return Model(folder.name, decoder.eval().requires_grad_(False), codes, names, folder)
 
 
 def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.float16) -> None:
@@ -146,58 +193,15 @@ def save_model(folder: str | Path, model: Model, dtype: torch.dtype = torch.floa
     tensors |= {"codes": model.codes}
     for layer in range(model.decoder.depth):
         tensors[f"lin{layer}.weight"] = getattr(model.decoder, f"lin{layer}").weight
-    _write_specs(folder, plain, model.shapes)
+    write_specs(folder / SPECS, plain, model.shapes)
     save_tensors(folder / "model.safetensors", tensors, dtype)
 
 
 def save_experiment(folder: str | Path, decoder: Decoder, codes: Tensor, shapes: tuple[str, ...]) -> None:
     """Writes DeepSDF's own layout, with the key names that its original code reads."""
     folder = Path(folder)
-    _write_specs(folder, decoder.specs, shapes)
+    write_specs(folder / SPECS, decoder.specs, shapes)
     write_weights(folder, decoder, codes)
-
-
-def _write_specs(folder: Path, specs: NetworkSpecs, shapes: tuple[str, ...]) -> None:
-    network = asdict(specs)
-    length = network.pop("code_length")
-    content = {"NetworkArch": "deep_sdf_decoder", "NetworkSpecs": network, "CodeLength": length, "Shapes": shapes}
-    save_json(folder / "specs.json", content)
-
-
-def _read_specs(folder: Path) -> tuple[NetworkSpecs, tuple[str, ...]]:
-    path = folder / "specs.json"
-    if not path.is_file():
-        raise ValueError(
-            f"{folder} is not a DeepSDF experiment: it has no specs.json, which names the network's layers"
-        )
-    with error_context(f"{path} is not a DeepSDF specification", path):
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-        _check_architecture(content)
-        network = content["NetworkSpecs"]
-        specs = NetworkSpecs(
-            dims=tuple(int(width) for width in network["dims"]),
-            code_length=int(content["CodeLength"]),
-            latent_in=_layers(network, "latent_in"),
-            norm_layers=_layers(network, "norm_layers"),
-            weight_norm=bool(network.get("weight_norm", False)),
-            xyz_in_all=bool(network.get("xyz_in_all", False)),
-            use_tanh=bool(network.get("use_tanh", False)),
-            dropout=_layers(network, "dropout"),
-            dropout_prob=float(network.get("dropout_prob") or 0.0),
-        )
-        shapes = tuple(str(shape) for shape in content.get("Shapes") or ())
-    return specs, shapes
-
-
-def _check_architecture(content: dict) -> None:
-    architecture = content.get("NetworkArch") or "deep_sdf_decoder"
-    dimension = content["NetworkSpecs"].get("geom_dimension") or 3
-    if architecture != "deep_sdf_decoder" or dimension != 3:
-        raise ValueError(f"{architecture} of {dimension}-D points; only deep_sdf_decoder of 3-D points can be read")
-
-
-def _layers(network: dict, key: str) -> tuple[int, ...]:
-    return tuple(int(layer) for layer in network.get(key) or ())
 
 
 def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
@@ -207,25 +211,26 @@ def _read_safetensors(path: Path) -> tuple[Path, dict[str, Tensor], Tensor]:
     return path, tensors, codes
 
 
-def _check_codes(codes: Tensor, specs: NetworkSpecs, folder: Path) -> None:
-    if codes.dim() != 2 or codes.shape[1] != specs.code_length or not len(codes):
-        raise ValueError(
-            f"{folder} has codes of shape {list(codes.shape)}, but specs.json asks for [n, {specs.code_length}]"
-        )
+def _check_codes(codes: Tensor, length: int, folder: Path, described: str) -> None:
+    if codes.dim() != 2 or codes.shape[1] != length or not len(codes):
+        raise ValueError(f"{folder} has codes of shape {list(codes.shape)}, but {described} asks for [n, {length}]")
     if not codes.isfinite().all():
         raise ValueError(f"{folder} has latent codes that are not finite; the training that wrote them has diverged")
 
 
-def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path) -> Decoder:
-    """Returns the decoder with the weights, whose names, shapes and values are checked."""
+def _filled(decoder: Decoder, state: dict[str, Tensor], source: Path, described: str) -> Decoder:
+    """Returns the decoder with the weights, whose names, shapes and values are checked.
+
+    `described` is the name of the file that describes the network.
+    """
     expected = decoder.state_dict()
     for key in sorted(expected.keys() | state.keys()):
         if key not in state:
-            raise ValueError(f"{source} lacks {key}, which specs.json calls for")
+            raise ValueError(f"{source} lacks {key}, which {described} calls for")
         if key not in expected:
-            raise ValueError(f"{source} has {key}, for which specs.json has no place")
+            raise ValueError(f"{source} has {key}, for which {described} has no place")
         if state[key].shape != expected[key].shape:
-            shapes = f"has shape {list(state[key].shape)}, but specs.json asks for {list(expected[key].shape)}"
+            shapes = f"has shape {list(state[key].shape)}, but {described} asks for {list(expected[key].shape)}"
             raise ValueError(f"{source}: {key} {shapes}")
         if state[key].layout != torch.strided:
             raise ValueError(f"{source}: {key} is a {state[key].layout} tensor; weights are dense")

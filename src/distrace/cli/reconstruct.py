@@ -9,6 +9,7 @@ import tyro
 
 from distrace.cli.common import NONE, Every, Flag, Format, Views, check_formats
 from distrace.cli.console import Run, console, progress, start
+from distrace.cli.metrics_log import Log, MetricsLog, check_log, is_due
 from distrace.cli.reconstructed import Reconstructed
 from distrace.data.photograph import Photograph
 from distrace.data.photographs import load_photographs, notes
@@ -54,12 +55,14 @@ class Reconstruct:
     format: tuple[Format, ...] = ("ply",)  # of the mesh, one or several
     seed: int = 0
     save_every: float = 60.0  # seconds between checkpoints
+    log: Log = "none"  # beside metrics.jsonl, write event files to OUT/tensorboard
     device: str = "cpu"
 
     @flushed_denormals()
     def run(self) -> None:
         saving = Every(self.save_every)
         check_formats(self.format)
+        check_log(self.log)
         from distrace.data.background_segmentation import masked  # brings scikit-image
 
         run = start(self.out, self.device)
@@ -73,7 +76,7 @@ class Reconstruct:
                 run.warn(_doubt(each))
         fitted_to, held_out = parted(found.views, self.held_out)
         with run_lock(run.out):
-            state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving)
+            state = fitted(run, fitted_to, (held_out or fitted_to)[0], self.config, self.specs, saving, self.log)
             found_shape = Reconstructed(self.views.name, state, self.config, found.unit_sphere, fitted_to, held_out)
             found_shape.save(run, resolved, self.format)
 
@@ -120,8 +123,9 @@ def fitted(
     config: ReconstructConfig,
     specs: SurfaceSpecs,
     saving: Every,
+    log: Log = "none",
 ) -> Reconstruction:
-    """Continues from the folder's checkpoint to the last step; saves checkpoints, and previews of one view."""
+    """Continues from the folder's checkpoint to the last step; saves checkpoints, losses, and previews of one view."""
     marks = [fingerprint(view) for view in views]
     state = load_reconstruction(run.out, config, specs, marks, run.device)
     if state.step:
@@ -133,9 +137,11 @@ def fitted(
     names = [view.name for view in views]
     save_json(run.out / "config.json", {**asdict(config), **asdict(specs), "photographs": names})
     due = -(-config.total // PREVIEWS)
-    with progress("reconstructing", config.total) as bar:
+    with progress("reconstructing", config.total) as bar, MetricsLog(run.out, state.step, log) as metrics:
         for step in reconstruct(views, state, config, depths):
             bar.advance(", ".join(f"{name} {values[-1]:.4f}" for name, values in state.loss_history.items()), to=step)
+            if is_due(step, config.steps, config.total):
+                metrics.write(step, _metrics(state, config, len(depths) > 0))
             if step % due == 0:
                 small = compared_view(state, shown, PREVIEWED)
                 save_png(run.out / "previews" / f"{step:07d}.png", small.picture)
@@ -161,6 +167,16 @@ def _initialised(state: Reconstruction, views: Sequence[Photograph], config: Rec
         console.print("initialising the network from silhouettes and depths")
         initialise(state, hull, config, depths)
     return depths
+
+
+def _metrics(state: Reconstruction, config: ReconstructConfig, with_depths: bool) -> dict[str, float]:
+    """Returns the loss of the last steps, its terms before their weights, and the learning rate."""
+    terms = {name: values[-1] for name, values in state.loss_history.items()}
+    colours = terms.pop("refinement", None)
+    if colours is not None:
+        return {"loss": colours, "learning_rate": config.rate_at(state.step - 1)}
+    loss = sum(config.weight(name, with_depths) * value for name, value in terms.items())
+    return {"loss": loss, **terms, "learning_rate": config.rate_at(state.step - 1)}
 
 
 def _doubt(view: MaskOverlap) -> str:

@@ -1,45 +1,42 @@
 """`train`: from samples to a model; an interrupted run continues when run again."""
 
 import math
+import warnings
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from statistics import median_high
 from typing import Annotated, Any
 
-import torch
 import tyro
 
-from distrace.antialiasing import clay_picture
-from distrace.checkpoints.model import Model, save_experiment
-from distrace.cli.common import NONE, Every, Flag, Orbit, default, opened
-from distrace.cli.console import Run, console, progress, start
+from distrace.checkpoints.model import Model
+from distrace.cli.common import NONE, Every, Flag, default, opened
+from distrace.cli.console import Run, console, start
+from distrace.cli.metrics_log import Log, check_log
 from distrace.cli.train_colours import train_colours
 from distrace.cli.train_samples import sample_files
+from distrace.cli.training_run import TrainingRun
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import run_lock
-from distrace.render import render
-from distrace.report.charts import plot_history
-from distrace.shading import save_png, side_by_side
 from distrace.threads import flushed_denormals
 from distrace.training.batches import Samples, load_samples
 from distrace.training.checkpointing import load_training, save_training
 from distrace.training.colours import ColourTrainConfig
 from distrace.training.config import TrainConfig
+from distrace.training.distributed import Processes, joined
 from distrace.training.fine_tuning import Distillation, oversampled
-from distrace.training.losses import STEPS_PER_LOSS
+from distrace.training.mapped_samples import map_samples, open_mapped
 from distrace.training.trainer import Training, begin_with, faster_in_bfloat16, start_training
-from distrace.training.trainer import train as run_training
 
 DEEPSDF = {"layers": 8, "width": 512, "code_length": 256}
-TRIAL_STEPS = 20  # timed to choose the steps for --minutes
-PREVIEWED = 5  # shapes
 
 
 @dataclass(frozen=True)
 class Train:
     """Train a DeepSDF decoder and the codes of its shapes.
 
-    A run that was interrupted continues when run again. It keeps its options, unless others are given.
+    A run that was interrupted continues when run again. It keeps its options, unless others are given. `torchrun
+    --nproc-per-node 2 .venv/bin/distrace train …` trains in two processes.
     """
 
     samples: tyro.conf.Positional[Path]  # a folder of samples, as `sample` makes it, or of meshes
@@ -68,13 +65,16 @@ class Train:
     colour: Flag = False
     """train colours for the shapes of --begin-with, which stay as they are, from a folder of textured meshes"""
     seed: Annotated[int | None, default(TrainConfig.seed)] = None
+    memory_map: Flag = False  # read samples from the disk when they are drawn; several processes always do
     save_every: float = 60.0  # seconds between checkpoints
+    log: Log = "none"  # beside metrics.jsonl, write event files to OUT/tensorboard
     device: str = "cpu"
 
     def run(self) -> None:
         if self.minutes is not None and not 0 < self.minutes < math.inf:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
+        check_log(self.log)
         if self.colour and self.begin_with is None:
             raise ValueError("--colour was given without --begin-with, which names the model to add colours to")
         run = start(self.out, self.device)
@@ -83,15 +83,22 @@ class Train:
                 config = replace(ColourTrainConfig(), **_given(self, "steps", "seed"))
                 train_colours(run, self.samples, self.split, self.begin_with, config)
             return
-        with run_lock(run.out), flushed_denormals(), run.noticing():
-            self._train(run, saving)
+        with joined(run.device) as (processes, run.device), flushed_denormals(), ExitStack() as stack:
+            processes.from_leader(lambda: stack.enter_context(run_lock(run.out)))
+            stack.enter_context(run.noticing())
+            if not processes.leads:
+                console.quiet = True
+                warnings.simplefilter("ignore")
+            self._train(run, processes, saving)
 
-    def _train(self, run: Run, saving: Every) -> None:
-        loaded = load_samples(sample_files(self.samples, self.out, self.split)).to(run.device)
+    def _train(self, run: Run, processes: Processes, saving: Every) -> None:
+        samples = self._samples(run, processes)
         initial = None if self.begin_with is None else opened(self.begin_with, run.device)
-        resumed = load_training(self.out, loaded.names, run.device)
+        resumed = load_training(self.out, samples.names, run.device)
+        processes.wait()  # until all have read the checkpoint, which the leader is about to write
         config = self._prolonged(*resumed) if resumed else self._fresh()
-        distillation = self._distillation(config, initial, loaded.names)
+        distillation = self._distillation(config, initial, samples.names)
+        job = TrainingRun(run, samples, config, distillation, processes)
         if resumed:
             training = resumed[0]
             if distillation and distillation.codes.shape != training.codes.shape:
@@ -100,14 +107,33 @@ class Train:
                 )
             console.print(f"continuing from step {training.step} of {config.steps}")
         else:
-            training, config = self._initialised(loaded, config, initial, distillation, run.device)
-            save_training(self.out, training, config, loaded.names)  # timed choices stay when the run is continued
+            training, job = self._initialised(job, initial)
+            if processes.leads:
+                save_training(self.out, training, job.config, samples.names)  # timed choices stay in a resumed run
         if initial is not None and config.dwell > 1:
+            if self.memory_map or processes.size > 1:
+                raise ValueError("--dwell needs all samples in memory; train in one process, without --memory-map")
             console.print(f"finding samples whose sign {initial.name} has wrong")
-            loaded = oversampled(loaded, initial, config.dwell)
-        loss = _run(run, loaded, training, config, distillation, saving)
-        facts = {"steps": training.step, "loss": loss, "shapes": len(loaded.names), "bfloat16": config.bfloat16}
-        run.finish({**facts, "losses": training.losses})
+            job = replace(job, samples=oversampled(samples, initial, config.dwell))
+        loss = job.train_to_end(training, saving, self.log)
+        if processes.leads:
+            facts = {"steps": job.config.steps, "loss": loss, "shapes": len(samples.names)}
+            run.finish({**facts, "bfloat16": job.config.bfloat16, "losses": training.losses})
+
+    def _samples(self, run: Run, processes: Processes) -> Samples:
+        """Returns the samples, in memory or mapped. Raises `ValueError` for more processes than shapes."""
+        paths = processes.from_leader(lambda: sample_files(self.samples, self.out, self.split))
+        if processes.size > len(paths):
+            raise ValueError(
+                f"{processes.size} processes were started for {len(paths)} shapes; each needs one at least"
+            )
+        if processes.size == 1 and not self.memory_map:
+            return load_samples(paths).to(run.device)
+        if self.dwell is not None and self.dwell > 1:
+            raise ValueError("--dwell needs all samples in memory; train in one process, without --memory-map")
+        folder = run.out / "mapped-samples"
+        processes.from_leader(lambda: map_samples(paths, folder))
+        return open_mapped(folder)
 
     def _specs(self, initial: Model | None) -> NetworkSpecs:
         """Returns a network with weight norm, as DeepSDF's, of the initial model's size if there is one."""
@@ -128,23 +154,19 @@ class Train:
     def _fresh(self) -> TrainConfig:
         return replace(self._changed(TrainConfig()), **_given(self, "samples_per_step", "seed"))
 
-    def _initialised(
-        self,
-        samples: Samples,
-        config: TrainConfig,
-        initial: Model | None,
-        distillation: Distillation | None,
-        device: torch.device,
-    ) -> tuple[Training, TrainConfig]:
-        """Returns a run before its first step, and its configuration."""
+    def _initialised(self, job: TrainingRun, initial: Model | None) -> tuple[Training, TrainingRun]:
+        """Returns a run before its first step, and its job with the choices that a stopwatch made."""
         specs = self._specs(initial)
-        config = replace(config, bfloat16=faster_in_bfloat16(specs, device))
-        training = start_training(len(samples.names), specs, config, device)
+        device = job.run.device
+        bfloat16 = job.processes.from_leader(lambda: faster_in_bfloat16(specs, device))
+        job = replace(job, config=replace(job.config, bfloat16=bfloat16))
+        names = job.samples.names
+        training = start_training(len(names), specs, job.config, device)
         if initial is not None:
-            begin_with(training, samples.names, initial)
+            begin_with(training, names, initial)
         if self.minutes is not None:
-            config = _timed(self.minutes, samples, specs, config, distillation, device)
-        return training, config
+            job = replace(job, config=job.timed(self.minutes, specs))
+        return training, job
 
     def _distillation(self, config: TrainConfig, initial: Model | None, names: list[str]) -> Distillation | None:
         """Returns the distillation's teacher, if any. Raises `ValueError` for options that lack --begin-with."""
@@ -182,64 +204,3 @@ class Train:
 def _given(command: Train, *names: str) -> dict[str, Any]:
     """Returns the options that were given."""
     return {name: getattr(command, name) for name in names if getattr(command, name) is not None}
-
-
-def _timed(
-    minutes: float,
-    samples: Samples,
-    specs: NetworkSpecs,
-    config: TrainConfig,
-    distillation: Distillation | None,
-    device: torch.device,
-) -> TrainConfig:
-    """Returns the configuration with the steps that fit into the time, by the median of a few trial steps."""
-    trial = start_training(len(samples.names), specs, config, device)
-    steps = run_training(samples, trial, replace(config, steps=TRIAL_STEPS), distillation)
-    seconds = median_high(step.seconds for step in steps)
-    return replace(config, steps=max(int(minutes * 60 / seconds), TRIAL_STEPS))
-
-
-def _run(
-    run: Run,
-    samples: Samples,
-    training: Training,
-    config: TrainConfig,
-    distillation: Distillation | None,
-    saving: Every,
-) -> float:
-    """Trains to the last step and saves checkpoints; returns the mean loss of the last steps."""
-    loss = training.losses[-1] if training.losses else math.nan
-    with progress("training", config.steps) as bar:
-        for step in run_training(samples, training, config, distillation):
-            if not math.isfinite(step.loss):
-                raise ValueError(
-                    f"the training has diverged at step {step.step}; {run.out} has the last checkpoint; lower"
-                    " --learning-rate or --wrong-sign, or look for wrong samples"
-                )
-            loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
-            bar.advance(f"loss {loss:.5f}", to=step.step)
-            if saving.passed():
-                _save(run, samples, training, config, distillation)
-    _save(run, samples, training, config, distillation)
-    return loss
-
-
-def _save(
-    run: Run, samples: Samples, training: Training, config: TrainConfig, distillation: Distillation | None
-) -> None:
-    """Writes the checkpoint, the model in DeepSDF's layout, the loss history, and previews of a few shapes."""
-    save_training(run.out, training, config, samples.names)
-    with run.optional("losses.png"):
-        plot_history(
-            run.out / "losses.png", training.losses, STEPS_PER_LOSS, "steps", f"mean loss of {STEPS_PER_LOSS} steps"
-        )
-    others = distillation.others if distillation else {}
-    codes = torch.stack([*training.codes.detach(), *others.values()])
-    model = Model(run.out.name, training.decoder, codes, (*samples.names, *others))
-    save_experiment(run.out, model.decoder, model.codes, model.shapes)
-    training.decoder.eval()
-    camera = Orbit(size=128).camera().to(run.device)
-    numbers = range(0, len(samples.names), max(len(samples.names) // PREVIEWED, 1))
-    with torch.no_grad():
-        pictures = [clay_picture(render(model.field(number), camera)) for number in numbers]
-    save_png(run.out / "preview.png", side_by_side(pictures))

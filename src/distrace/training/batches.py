@@ -2,6 +2,7 @@
 
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -20,41 +21,62 @@ MAX_DISTANCE = 4.0  # distance of a sample from such a shape
 
 
 @dataclass(frozen=True)
-class Samples:
-    """Signed samples of the training shapes: one tensor a shape, of points and distances."""
+class Side:
+    """The samples of all shapes outside of them, or inside: rows of a point and its distance, shape after shape."""
 
-    names: list[str]
-    outside: list[Float[Tensor, "_ 4"]]
-    inside: list[Float[Tensor, "_ 4"]]
+    rows: Float[Tensor, "n 4"]
+    counts: Int[Tensor, "shapes"]
+
+    @staticmethod
+    def of(parts: Sequence[Float[Tensor, "_ 4"]]) -> "Side":
+        """Returns a side from the rows of each shape."""
+        return Side(torch.cat(list(parts)), torch.tensor([len(part) for part in parts]))
 
     @cached_property
-    def sides(self) -> list[tuple[Float[Tensor, "_ 4"], Int[Tensor, "shapes"]]]:
-        """Outside and inside: the samples of all shapes, concatenated for a single gather, and their counts."""
-        sides = (self.outside, self.inside)
-        return [(torch.cat(parts), torch.tensor([len(part) for part in parts])) for parts in sides]
+    def parts(self) -> tuple[Float[Tensor, "_ 4"], ...]:
+        """The rows of each shape."""
+        return self.rows.split(self.counts.tolist())
+
+    def to(self, device: torch.device) -> "Side":
+        return Side(self.rows.to(device), self.counts)
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Signed samples of the training shapes."""
+
+    names: list[str]
+    outside: Side
+    inside: Side
 
     @cached_property
     def variant(self) -> Bool[Tensor, "shapes"]:
         return torch.tensor([VARIANT in name for name in self.names])
 
-    def drawn(
+    def draw(
         self, shapes: int, samples: int, variants: float
-    ) -> tuple[Int[Tensor, "shapes"], Float[Tensor, "shapes n 4"]]:
-        """Returns the numbers of random shapes, and `samples` of them in all: as many outside as inside.
+    ) -> tuple[Int[Tensor, "shapes"], Int[Tensor, "sides shapes n"]]:
+        """Returns the numbers of random shapes, and of `samples` of their rows in all: as many outside as inside.
 
         Variants are drawn with the weight `variants`, other shapes with 1.
         """
         chosen = torch.multinomial(torch.where(self.variant, variants, 1.0), min(shapes, len(self.names)))
         per_side = max(samples // len(chosen) // 2, 1)
-        drawn = []
-        for side, counts in self.sides:
+        rows = []
+        for side in (self.outside, self.inside):
+            counts = side.counts
             begins = counts.cumsum(0) - counts
             places = (torch.rand(len(chosen), per_side, dtype=torch.float64) * counts[chosen, None]).long()
-            drawn.append(side[(begins[chosen, None] + places).to(side.device)])
-        return chosen, torch.cat(drawn, dim=1)
+            rows.append(begins[chosen, None] + places)
+        return chosen, torch.stack(rows)
+
+    def at(self, rows: Int[Tensor, "sides shapes n"]) -> Float[Tensor, "shapes m 4"]:
+        """Returns the samples of rows that `draw` numbers, those outside before those inside."""
+        sides = zip((self.outside, self.inside), rows, strict=True)
+        return torch.cat([side.rows[numbers.to(side.rows.device)] for side, numbers in sides], dim=1)
 
     def to(self, device: torch.device) -> "Samples":
-        return Samples(self.names, [s.to(device) for s in self.outside], [s.to(device) for s in self.inside])
+        return Samples(self.names, self.outside.to(device), self.inside.to(device))
 
 
 def load_samples(paths: list[Path]) -> Samples:
@@ -63,28 +85,38 @@ def load_samples(paths: list[Path]) -> Samples:
     Rows with values that are not finite are dropped, with a `DoubtfulResult`. Raises `ValueError` for a file without
     `pos` and `neg` of shape [n, 4], of one sign only, or of a shape that is not in the unit sphere.
     """
-    outside = []
-    inside = []
-    dropped = 0
-    for path in paths:
-        with error_context(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg", path):
-            with np.load(path, allow_pickle=False) as archive:
-                sides = [archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg")]
-        with about(path):
-            pos = _finite("pos", sides[0])
-            neg = _finite("neg", sides[1])
-            _check_sides(pos, neg)
-        samples = np.concatenate([pos, neg])
-        dropped += sum(map(len, sides)) - len(samples)
-        outside.append(torch.from_numpy(samples[samples[:, 3] >= 0]))
-        inside.append(torch.from_numpy(samples[samples[:, 3] < 0]))
-    if dropped:
-        warnings.warn(f"{dropped} samples that are not finite were dropped", DoubtfulResult, stacklevel=3)
+    outside, inside, dropped = zip(*map(read_samples, paths), strict=True)
+    warn_of_dropped(sum(dropped))
+    return Samples(shape_names(paths), Side.of(outside), Side.of(inside))
+
+
+def read_samples(path: Path) -> tuple[Float[Tensor, "outside 4"], Float[Tensor, "inside 4"], int]:
+    """Returns the samples in a file, and the number of its rows that are not finite. Raises as `load_samples` does."""
+    with error_context(f"{path} is not a file of samples; one made by `distrace sample` holds pos and neg", path):
+        with np.load(path, allow_pickle=False) as archive:
+            sides = [archive[name].astype(np.float32, casting="same_kind") for name in ("pos", "neg")]
+    with about(path):
+        pos = _finite("pos", sides[0])
+        neg = _finite("neg", sides[1])
+        _check_sides(pos, neg)
+    samples = np.concatenate([pos, neg])
+    dropped = sum(map(len, sides)) - len(samples)
+    outside = torch.from_numpy(samples[samples[:, 3] >= 0])
+    return outside, torch.from_numpy(samples[samples[:, 3] < 0]), dropped
+
+
+def warn_of_dropped(rows: int) -> None:
+    if rows:
+        warnings.warn(f"{rows} samples that are not finite were dropped", DoubtfulResult, stacklevel=4)
+
+
+def shape_names(paths: list[Path]) -> list[str]:
+    """Returns what the shapes of files are called."""
     names = [path.stem for path in paths]
     if len(set(names)) < len(names):
         root = Path(os.path.commonpath([path.parent for path in paths]))
         names = ["-".join(path.relative_to(root).with_suffix("").parts) for path in paths]
-    return Samples(names, outside, inside)
+    return names
 
 
 def _finite(name: str, side: np.ndarray) -> Float[np.ndarray, "n 4"]:

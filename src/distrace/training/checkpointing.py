@@ -2,17 +2,20 @@
 
 import math
 import operator
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor, nn
 
 from distrace.errors import error_context
 from distrace.fields.decoder import NetworkSpecs
 from distrace.files import atomic_write
 from distrace.training.config import TrainConfig
+from distrace.training.distributed import Processes
 from distrace.training.losses import STEPS_PER_LOSS
-from distrace.training.trainer import Training, start_training
+from distrace.training.trainer import Training, adam, start_training
 
 NAME = "checkpoint.pt"
 
@@ -31,6 +34,30 @@ def save_training(folder: Path, training: Training, config: TrainConfig, names: 
     }
     with atomic_write(folder / NAME) as file:
         torch.save(state, file)
+
+
+def sharded(training: Training, processes: Processes) -> Training:
+    """The run with the codes of this process's shapes alone."""
+    return training if processes.size == 1 else _with_codes(training, processes.part)
+
+
+def gathered(training: Training, processes: Processes, shapes: int) -> Training:
+    """The run with the codes of all shapes, from what each process has; all processes must call it."""
+    if processes.size == 1:
+        return training
+    return _with_codes(training, lambda rows: processes.gathered(rows, shapes))
+
+
+def _with_codes(training: Training, change: Callable[[Tensor], Tensor]) -> Training:
+    """The run with other codes: `change` is applied to them and to their moments in the optimiser."""
+    codes = nn.Parameter(change(training.codes.detach()))
+    stored = training.optimiser.state_dict()
+    (number,) = stored["param_groups"][-1]["params"]
+    moments = stored["state"].get(number, {})  # none before the first step
+    changed = {name: change(value) if value.dim() else value for name, value in moments.items()}
+    optimiser = adam(training.decoder, codes)
+    optimiser.load_state_dict(stored | {"state": stored["state"] | ({number: changed} if moments else {})})
+    return replace(training, codes=codes, optimiser=optimiser)
 
 
 def load_training(folder: Path, names: list[str], device: torch.device) -> tuple[Training, TrainConfig] | None:

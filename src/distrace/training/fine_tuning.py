@@ -11,7 +11,7 @@ from torch import Tensor
 from distrace.checkpoints.model import VARIANT, Model
 from distrace.fields.decoder import Decoder
 from distrace.prior import Prior, prior_of
-from distrace.training.batches import Samples
+from distrace.training.batches import Samples, Side
 
 MAX_CORRELATION = 0.9  # highest correlation with a training code, at which samples constrain the field
 REACH = 0.02  # samples this near to one whose sign is wrong are oversampled too, on both sides of the surface
@@ -58,14 +58,14 @@ def oversampled(samples: Samples, model: Model, times: int) -> Samples:
     """
     outside = []
     inside = []
-    for name, pos, neg in zip(samples.names, samples.outside, samples.inside, strict=True):
+    for name, pos, neg in zip(samples.names, samples.outside.parts, samples.inside.parts, strict=True):
         if VARIANT not in name and name in model.shapes:
             wrong_pos, wrong_neg = _hard_samples(model, name, torch.cat([pos, neg])).split([len(pos), len(neg)])
             pos = torch.cat([pos, pos[wrong_pos].repeat(times - 1, 1)])
             neg = torch.cat([neg, neg[wrong_neg].repeat(times - 1, 1)])
         outside.append(pos)
         inside.append(neg)
-    return Samples(samples.names, outside, inside)
+    return Samples(samples.names, Side.of(outside), Side.of(inside))
 
 
 @torch.no_grad()
