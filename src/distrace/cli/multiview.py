@@ -39,7 +39,8 @@ COLOURED_VIEWS = 4  # on the page
 class Multiview:
     """Find a shape and its placement from photographs with known cameras.
 
-    It needs a model of the object's class. It uses masks where the folder has some.
+    It needs a model of the object's class. It uses masks where the folder has some. With --fixed a single photograph
+    with a mask is enough.
     """
 
     model: tyro.conf.Positional[ModelName]
@@ -62,7 +63,7 @@ class Multiview:
         run = start(self.out, self.device)
         resolved = MeshConfig(self.resolution, device=run.device)
         model = opened_for(run, self.model)
-        found = load_photographs(self.views)
+        found = load_photographs(self.views, 1 if self.fixed else 2)  # of one, the silhouette tells the shape
         console.print(f"{len(found.views)} views, {found.layout}; {_described(found)}")
         for note in notes(found):
             console.print(note)

@@ -44,8 +44,8 @@ class Photographs:
     sphere_known: bool = False  # whether the folder says where the unit sphere lies
 
 
-def load_photographs(folder: Path) -> Photographs:
-    """Reads the photographs of a folder, in whichever layout it has.
+def load_photographs(folder: Path, least: int = 2) -> Photographs:
+    """Reads the photographs of a folder, in whichever layout it has; fewer than two need a `unit_sphere` there.
 
     Raises `ValueError`, in one sentence that names file and field, for what is missing or makes no sense.
     """
@@ -54,7 +54,7 @@ def load_photographs(folder: Path) -> Photographs:
     frames = next((found for layout in LAYOUTS if (found := layout.read(folder)) is not None), None)
     if frames is None:
         raise ValueError(f"{folder} holds no photographs with cameras; looked for {LOOKED_FOR}")
-    if len(frames.views) < 2:
+    if len(frames.views) < (2 if frames.unit_sphere is None else least):
         raise ValueError(f"{folder}: its {frames.layout} describes {len(frames.views)} views; at least two are needed")
     names = _distinct([frame.image.stem for frame in frames.views])
     views = [replace(_photograph(frame), name=name) for frame, name in zip(frames.views, names)]
