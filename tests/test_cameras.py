@@ -85,8 +85,12 @@ def test_nothing_of_the_users_is_overwritten(refused: Callable[..., str], tmp_pa
     before = {path: path.read_bytes() for path in photographs.iterdir()}
     assert "images would be replaced" in refused(photographs, "--out", tmp_path)
     other = write_noise(tmp_path / "other", 3)
-    assert "holds images/ of something else" in refused(other, "--out", tmp_path)
+    assert "holds images/ that no run of" in refused(other, "--out", tmp_path)
     assert {path: path.read_bytes() for path in photographs.iterdir()} == before
+    (tmp_path / "out" / "work").mkdir(parents=True)
+    (tmp_path / "out" / "masks").mkdir()
+    (tmp_path / "out" / "work" / "input.json").write_text("{}")
+    assert "masks of other photographs" in refused(other, "--out", tmp_path / "out")
 
 
 def test_photographs_that_share_nothing_are_refused_in_one_sentence(

@@ -3,6 +3,7 @@
 import glob
 import json
 import os
+import shutil
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -73,6 +74,13 @@ def save_tensors(path: str | Path, tensors: Mapping[str, Tensor], dtype: torch.d
         content[name] = (tensor.detach().to(dtype) if tensor.is_floating_point() else tensor).contiguous()
     with atomic_write(path) as file:
         file.write(safetensors.torch.save(content))
+
+
+def emptied(folder: Path) -> Path:
+    """Makes an empty folder, in place of the one that was there."""
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    return folder
 
 
 def file_in_the_way(folder: Path) -> Path | None:

@@ -15,13 +15,12 @@ from distrace.data.structure_from_motion import (
     MIN_IMAGES,
     Database,
     Picture,
-    emptied,
     pairs,
     undistort,
     upright,
     with_principal_points,
 )
-from distrace.files import run_lock, save_json, save_text
+from distrace.files import emptied, run_lock, save_json, save_text
 from distrace.optional import require
 from distrace.report.cameras_page import cameras_page
 
@@ -78,7 +77,9 @@ class Cameras:
             raise ValueError(f"{self.source} would be replaced; give another folder than --out {self.out}")
         foreign = [name for name in folders if (self.out / name).exists()]
         if foreign and not (self.work / "input.json").is_file():
-            raise ValueError(f"--out {self.out} holds {foreign[0]}/ of something else; give another folder")
+            raise ValueError(
+                f"--out {self.out} holds {foreign[0]}/ that no run of `cameras` wrote, by its work/; give another"
+            )
 
     def _pictures(self) -> list[Picture]:
         """Returns the copies of the photographs; those of an earlier run where the input is the same."""
@@ -95,6 +96,8 @@ class Cameras:
         if before.get("given") == given and before.get("pictures"):
             console.print("continuing from the photographs and features of an earlier run")
             return [Picture(**each) for each in before["pictures"]]
+        if (self.out / "masks").exists():
+            raise ValueError(f"{self.out / 'masks'} are masks of other photographs; remove them, or give another --out")
         emptied(self.work)
         save_json(note, {"given": given})
         if self.source.is_dir():

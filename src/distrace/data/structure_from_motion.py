@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from distrace.files import emptied
 from distrace.optional import require
 
 T = TypeVar("T")
@@ -203,13 +204,6 @@ def undistort(model: Any, images: Path, out: Path, masks: Path | None = None) ->
         (_undistorted(model_folder, masks, out / "made") / "images").rename(out / "masks")
     shutil.rmtree(made)
     shutil.rmtree(model_folder)
-
-
-def emptied(folder: Path) -> Path:
-    """Makes an empty folder, in place of the one that was there."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder
 
 
 def _undistorted(model_folder: Path, images: Path, made: Path) -> Path:
