@@ -19,6 +19,7 @@ from distrace.render import render
 CANDIDATES = 64  # training palettes that are compared before the fit
 CANDIDATE_POINTS = 400
 RIDGE = 0.03  # of the light's coefficients in that comparison, for each point
+USUAL_BRIGHTNESS = 0.7  # of a white surface in a photograph: colours alone do not tell it
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,7 @@ class ColourFitConfig:
     learning_rate: float = 0.03
     code_weight: float = 1e-3  # of the colour code's mean square
     tint_weight: float = 0.02  # of how much the light's red, green and blue differ
+    brightness_weight: float = 0.01  # of the squared logarithm of how far it is from USUAL_BRIGHTNESS
     seed: int = 0
 
 
@@ -64,7 +66,7 @@ def fit_colours(
     """
     random = torch.Generator().manual_seed(config.seed)
     seen = _seen_surface(photographs, sdf, place)
-    colour, light = _best_palette(colours, seen, code, random)
+    colour, light = _best_palette(colours, seen, code, config, random)
     colour = colour.clone().requires_grad_()
     light = light.repeat(1 if same_light else len(photographs), 1, 1).requires_grad_()
     adam = torch.optim.Adam([colour, light], lr=config.learning_rate)
@@ -76,6 +78,7 @@ def fit_colours(
         tint = (light - light.mean(-1, keepdim=True)).square().mean()
         loss = (to_srgb(albedo * brightness) - part.colours).abs().mean()
         loss = loss + config.code_weight * colour.square().mean() + config.tint_weight * tint
+        loss = loss + config.brightness_weight * _unusual(brightness)
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -120,7 +123,7 @@ def _seen_surface(photographs: Sequence[Photograph], sdf: SDF, place: Similarity
 
 @torch.no_grad()
 def _best_palette(
-    colours: Colours, seen: _Seen, code: Float[Tensor, "length"], random: torch.Generator
+    colours: Colours, seen: _Seen, code: Float[Tensor, "length"], config: ColourFitConfig, random: torch.Generator
 ) -> tuple[Float[Tensor, "colour"], Float[Tensor, "9 3"]]:
     """Returns the training palette, or their mean, and the light that explain the colours best."""
     part = seen.drawn(CANDIDATE_POINTS, random)
@@ -131,10 +134,17 @@ def _best_palette(
     for candidate in candidates:
         albedo = to_linear(colours.decoder(part.points, part.normals, code, candidate))
         light = fitted_light(part.white, albedo, to_linear(part.colours))
+        brightness = part.white @ light
+        loss = (to_srgb(albedo * brightness) - part.colours).abs().mean()
         found.append(light)
-        losses.append((to_srgb(albedo * (part.white @ light)) - part.colours).abs().mean())
+        losses.append(loss + config.brightness_weight * _unusual(brightness))
     best = int(torch.stack(losses).argmin())
     return candidates[best], found[best]
+
+
+def _unusual(brightness: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+    """Returns the squared logarithm of how much brighter or darker white would be than in most photographs."""
+    return (brightness.mean().clamp_min(0.01) / USUAL_BRIGHTNESS).log().square()
 
 
 def fitted_light(

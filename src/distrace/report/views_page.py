@@ -51,7 +51,8 @@ def views_page(
     for step in steps:
         losses.setdefault(step.name, []).append(step.loss)
     cells = [[view.name, f"{view.colour:.3f}", "doubtful" if view.is_outlier else ""] for view in agreed]
-    lead = f"A shape from {len(views)} photographs without depth, by the model {model.name}."
+    counted = "one photograph" if len(views) == 1 else f"{len(views)} photographs"
+    lead = f"A shape from {counted} without depth, by the model {model.name}."
     about = "Median difference of colours, from 0 to 1, between a view and the other views of the same points."
     colours: list[Html] = []
     if coloured:
@@ -65,7 +66,7 @@ def views_page(
             section("Views", paragraph("Photographs with the shape's outline, and the shape."), row(*pictures)),
             *colours,
             space_section({"Shape": mesh}),
-            section("Loss", curves(losses, "iteration", "loss", True, last.name)),
+            *([section("Loss", curves(losses, "iteration", "loss", True, last.name))] if len(steps) > 1 else []),
             *([section("Agreement", paragraph(about), table(["view", "colour", ""], cells))] if cells else []),
         ],
     )
