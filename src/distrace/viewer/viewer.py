@@ -48,7 +48,7 @@ if (scale > 1) history.replaceState(null, "", "?initialCameraPosition=" + eye.ma
 
 
 def framing_position(aspect: float) -> tuple[float, float, float]:
-    """Returns where the first camera is: `EYE`, or as far behind it as a narrow window needs to show the unit sphere."""
+    """Returns where the first camera is: at `EYE`, or farther where a narrow window would cut the unit sphere."""
     half = math.atan(math.tan(FIELD_OF_VIEW / 2) * aspect)
     scale = max(1.0, MARGIN / math.sin(half) / math.hypot(*EYE))
     x, y, z = EYE
