@@ -662,11 +662,12 @@ def refuses(
     capsys: pytest.CaptureFixture,
     program: str = "distrace",
 ) -> None:
-    """What is wrong ends in one line that says so, and leaves no result."""
+    """What is wrong ends in one line that says so, and leaves no result and no empty folder."""
     arguments = tuple(word.format(**place) for word in words.split())
     out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
     assert message in one_line(run, capsys, (*arguments, *out), program=program)
     assert not (Path(place["out"]) / "result.json").exists()
+    assert not Path(place["out"]).is_dir() or any(Path(place["out"]).iterdir())
 
 
 @pytest.mark.parametrize(("words", "message"), BAD, ids=[words.replace("/", ".") for words, _ in BAD])
@@ -674,6 +675,17 @@ def test_whatever_is_wrong_is_one_line_and_status_two(
     words: str, message: str, place: dict[str, str], run: Command, capsys: pytest.CaptureFixture
 ) -> None:
     refuses(words, message, place, run, capsys)
+
+
+def test_a_refused_command_removes_only_empty_folders_that_it_made(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes").write_text("")
+    for out in ("made/below", "empty", "empty/below", "full", "full/below"):
+        one_line(run, capsys, ("render", model, "--code", 9, "--out", tmp_path / out))
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"empty", "full", "full/notes"}
 
 
 def test_cuda_is_refused_where_there_is_none(

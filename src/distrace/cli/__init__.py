@@ -6,8 +6,9 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, make_dataclass
+from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any
 
@@ -90,7 +91,8 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
         interrupted = f"{INTERRUPTED}; every written file is complete"
         if sys.argv[1] in RESUMABLE:
             interrupted += f", and {sys.argv[1]} continues when run again"
-        command.run()
+        with _without_empty_folders(getattr(command, "out", None)):
+            command.run()
         sys.stdout.flush()
     except KeyboardInterrupt:
         _end(program, interrupted, 130)
@@ -131,6 +133,19 @@ def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "
     if seed is not None and not 0 <= seed < 2**31:
         raise ValueError(f"--seed {seed} was given; a number from 0 to {2**31 - 1} is needed")
     return command
+
+
+@contextmanager
+def _without_empty_folders(out: Path | None) -> Iterator[None]:
+    """Where a command fails, removes the folders on the way to `out` that it made, if it wrote nothing there."""
+    made = [] if out is None else [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # it holds something, or was not made
+                folder.rmdir()
+        raise
 
 
 def discard_output() -> None:
