@@ -548,7 +548,7 @@ BAD = [
     ("render {model} --code -1", "-1 is neither the number nor the name of a training shape"),
     ("render {model} --size -3", "-3 × -3"),
     ("render {model} --size 0", "0 × 0"),
-    ("render {model} --size 4000000", "not enough memory"),
+    ("render {model} --size 4000000", "not enough memory for --size 4000000 --samples 1; use a smaller size"),
     ("render {model} --strategy dynamic --steps 0", "steps=0"),
     ("render {model} --steps 5", "fast counts none"),
     ("render {model} --samples 0", "--samples 0 was given; give a whole number from 1 to 16"),

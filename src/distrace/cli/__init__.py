@@ -73,6 +73,15 @@ COMMANDS: Commands = {
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
 INTERRUPTED = "interrupted"
+GROWING = (
+    "size",
+    "sizes",
+    "resolution",
+    "samples",
+    "rays",
+    "width",
+    "samples_per_step",
+)  # options that memory grows with
 RESUMABLE = ("sample", "train", "reconstruct")  # commands that continue when run again
 
 
@@ -103,7 +112,7 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
             raise
-        _end(program, "not enough memory; use a smaller size, or another device", 2)
+        _end(program, f"not enough memory{_sizes(command)}; use a smaller size, or another device", 2)
 
 
 def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "distrace", about: str = ABOUT) -> Any:
@@ -182,6 +191,17 @@ def _out_of_memory(error: Exception) -> bool:
     import torch
 
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate memory" in str(error)
+
+
+def _sizes(command: Any) -> str:
+    """Returns the options that a command's memory grows with, and their values."""
+    given: list[str] = []
+    for name in GROWING:
+        value = getattr(command, name, ())
+        numbers = value if isinstance(value, tuple) else (value,)
+        if numbers and all(isinstance(number, int) for number in numbers):
+            given.append(f"--{name.replace('_', '-')} {' '.join(map(str, numbers))}")
+    return f" for {' '.join(given)}" if given else ""
 
 
 def _one_line(box: str) -> str:
