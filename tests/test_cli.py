@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -239,6 +240,35 @@ def test_shapes_lists_numbers_and_names(
     assert result(tmp_path, "shapes")["shapes"] == list(shapes)
     said = capsys.readouterr().out
     assert all(f"{number} {name}" in said for number, name in enumerate(shapes))
+    assert "2 shapes are listed\n" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "listed"),
+    [
+        ((), ["couch", "stool"]),
+        (("--all",), ["couch", "couch~mirrored", "stool", "sofas~1", "sofas~2", "sofas~3"]),
+        (("--name", "Couch"), ["couch"]),
+        (("--name", "couch", "--all"), ["couch", "couch~mirrored"]),
+    ],
+)
+def test_shapes_lists_meshes_and_with_all_their_variants(
+    options: tuple[str, ...],
+    listed: list[str],
+    run: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ("couch", "couch~mirrored", "stool", "sofas~1", "sofas~2", "sofas~3")
+    of_names = SimpleNamespace(shapes=names)
+    monkeypatch.setattr("distrace.cli.shapes.opened_for", lambda run, name: of_names)
+    run("shapes", "sofas", *options, "--out", tmp_path)
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in said[: len(listed)]] == [[str(names.index(name)), name] for name in listed]
+    rest = " ".join(" ".join(said[len(listed) :]).split())
+    assert rest.startswith(f"{len(listed)} shapes are listed; the model has 2 of meshes, 1 variants")
+    assert "3 procedural ones" in rest
 
 
 @pytest.mark.parametrize(("given", "columns"), [("1", 1), ("all", 2), ("9", 2)])
@@ -576,6 +606,8 @@ BAD = [
     ("mesh {model} --resolution 3", "resolution of 3"),
     ("shapes {model} --thumbnails -1", "--thumbnails -1 was given"),
     ("shapes {model} --thumbnails some", "--thumbnails"),
+    ("shapes sofas --name nowhere", "--name nowhere was given, and no listed shape has it in its name"),
+    ("shapes sofas --name warped1", "--all lists 16 variants and procedural shapes"),
     ("shapes {tmp}/nothing", "no specs.json"),
     ("mesh {model} --resolution 20", "resolution of 20"),
     ("mesh {model} --code 9", "code 9"),

@@ -73,15 +73,8 @@ COMMANDS: Commands = {
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
 INTERRUPTED = "interrupted"
-GROWING = (
-    "size",
-    "sizes",
-    "resolution",
-    "samples",
-    "rays",
-    "width",
-    "samples_per_step",
-)  # options that memory grows with
+# Options that a command's memory grows with:
+GROWING = ("size", "sizes", "resolution", "samples", "rays", "width", "samples_per_step")
 RESUMABLE = ("sample", "train", "reconstruct")  # commands that continue when run again
 
 
