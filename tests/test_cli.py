@@ -434,6 +434,14 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
     assert Image.open(out / "filmstrip.png").width > 100
 
 
+def test_pose_warns_of_a_camera_that_disagrees(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
+    for code, doubtful in ((1, False), (0, True)):  # the observation's sphere, and a smaller one
+        words = ("--code", code, "--starts", 1, "--out", tmp_path / str(code))
+        run("pose", model, observation, *words)
+        warnings = result(tmp_path / str(code))["warnings"]
+        assert any("camera is doubtful" in warning for warning in warnings) == doubtful
+
+
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:
