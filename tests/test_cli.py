@@ -271,6 +271,13 @@ def test_shapes_lists_meshes_and_with_all_their_variants(
     assert "3 procedural ones" in rest
 
 
+def test_render_warns_of_a_camera_in_the_solid(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run("render", model, "--code", 1, "--distance", 0.3, "--size", 16, "--out", tmp_path)
+    assert "warning: 256 of 256 rays start inside the solid: is the camera in it" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(("given", "columns"), [("1", 1), ("all", 2), ("9", 2)])
 def test_shapes_draws_the_first_shapes_in_one_sheet(
     given: str, columns: int, model: Path, run: Command, tmp_path: Path

@@ -101,6 +101,9 @@ def test_a_folder_without_a_shape_is_refused(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("{}")
     with pytest.raises(ValueError, match="holds no shape"):
         open_scene(str(tmp_path))
+    (tmp_path / "result.json").write_text('{"model": "sofas"}')  # as that of `render`
+    with pytest.raises(ValueError, match="holds no shape; give the model, sofas, with --code, or what complete, pose"):
+        open_scene(str(tmp_path))
     (tmp_path / "result.json").write_text("[")
     with pytest.raises(ValueError, match=r"result\.json"):
         open_scene(str(tmp_path))
