@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import av
 import numpy as np
@@ -239,6 +240,42 @@ def test_shapes_lists_numbers_and_names(
     assert result(tmp_path, "shapes")["shapes"] == list(shapes)
     said = capsys.readouterr().out
     assert all(f"{number} {name}" in said for number, name in enumerate(shapes))
+    assert "2 shapes are listed\n" in said
+
+
+@pytest.mark.parametrize(
+    ("options", "listed"),
+    [
+        ((), ["couch", "stool"]),
+        (("--all",), ["couch", "couch~mirrored", "stool", "sofas~1", "sofas~2", "sofas~3"]),
+        (("--name", "Couch"), ["couch"]),
+        (("--name", "couch", "--all"), ["couch", "couch~mirrored"]),
+    ],
+)
+def test_shapes_lists_meshes_and_with_all_their_variants(
+    options: tuple[str, ...],
+    listed: list[str],
+    run: Command,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    names = ("couch", "couch~mirrored", "stool", "sofas~1", "sofas~2", "sofas~3")
+    of_names = SimpleNamespace(shapes=names)
+    monkeypatch.setattr("distrace.cli.shapes.opened_for", lambda run, name: of_names)
+    run("shapes", "sofas", *options, "--out", tmp_path)
+    said = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in said[: len(listed)]] == [[str(names.index(name)), name] for name in listed]
+    rest = " ".join(" ".join(said[len(listed) :]).split())
+    assert rest.startswith(f"{len(listed)} shapes are listed; the model has 2 of meshes, 1 variants")
+    assert "3 procedural ones" in rest
+
+
+def test_render_warns_of_a_camera_in_the_solid(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    run("render", model, "--code", 1, "--distance", 0.3, "--size", 16, "--out", tmp_path)
+    assert "warning: 256 of 256 rays start inside the solid: is the camera in it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(("given", "columns"), [("1", 1), ("all", 2), ("9", 2)])
@@ -404,6 +441,14 @@ def test_pose_finds_how_far_away_a_sphere_is(model: Path, observation: Path, run
     assert Image.open(out / "filmstrip.png").width > 100
 
 
+def test_pose_warns_of_a_camera_that_disagrees(model: Path, observation: Path, run: Command, tmp_path: Path) -> None:
+    for code, doubtful in ((1, False), (0, True)):  # the observation's sphere, and a smaller one
+        words = ("--code", code, "--starts", 1, "--out", tmp_path / str(code))
+        run("pose", model, observation, *words)
+        warnings = result(tmp_path / str(code))["warnings"]
+        assert any("camera is doubtful" in warning for warning in warnings) == doubtful
+
+
 def test_pose_finds_the_focal_length_and_starts_where_it_is_told(
     model: Path, observation: Path, run: Command, tmp_path: Path
 ) -> None:
@@ -548,7 +593,7 @@ BAD = [
     ("render {model} --code -1", "-1 is neither the number nor the name of a training shape"),
     ("render {model} --size -3", "-3 × -3"),
     ("render {model} --size 0", "0 × 0"),
-    ("render {model} --size 4000000", "not enough memory"),
+    ("render {model} --size 4000000", "not enough memory for --size 4000000 --samples 1; use a smaller size"),
     ("render {model} --strategy dynamic --steps 0", "steps=0"),
     ("render {model} --steps 5", "fast counts none"),
     ("render {model} --samples 0", "--samples 0 was given; give a whole number from 1 to 16"),
@@ -576,6 +621,8 @@ BAD = [
     ("mesh {model} --resolution 3", "resolution of 3"),
     ("shapes {model} --thumbnails -1", "--thumbnails -1 was given"),
     ("shapes {model} --thumbnails some", "--thumbnails"),
+    ("shapes sofas --name nowhere", "--name nowhere was given, and no listed shape has it in its name"),
+    ("shapes sofas --name warped1", "--all lists 16 variants and procedural shapes"),
     ("shapes {tmp}/nothing", "no specs.json"),
     ("mesh {model} --resolution 20", "resolution of 20"),
     ("mesh {model} --code 9", "code 9"),
@@ -662,11 +709,12 @@ def refuses(
     capsys: pytest.CaptureFixture,
     program: str = "distrace",
 ) -> None:
-    """What is wrong ends in one line that says so, and leaves no result."""
+    """What is wrong ends in one line that says so, and leaves no result and no empty folder."""
     arguments = tuple(word.format(**place) for word in words.split())
     out = () if "--out" in arguments or len(arguments) < 2 else ("--out", place["out"])
     assert message in one_line(run, capsys, (*arguments, *out), program=program)
     assert not (Path(place["out"]) / "result.json").exists()
+    assert not Path(place["out"]).is_dir() or any(Path(place["out"]).iterdir())
 
 
 @pytest.mark.parametrize(("words", "message"), BAD, ids=[words.replace("/", ".") for words, _ in BAD])
@@ -674,6 +722,17 @@ def test_whatever_is_wrong_is_one_line_and_status_two(
     words: str, message: str, place: dict[str, str], run: Command, capsys: pytest.CaptureFixture
 ) -> None:
     refuses(words, message, place, run, capsys)
+
+
+def test_a_refused_command_removes_only_empty_folders_that_it_made(
+    model: Path, run: Command, tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "notes").write_text("")
+    for out in ("made/below", "empty", "empty/below", "full", "full/below"):
+        one_line(run, capsys, ("render", model, "--code", 9, "--out", tmp_path / out))
+    assert {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")} == {"empty", "full", "full/notes"}
 
 
 def test_cuda_is_refused_where_there_is_none(

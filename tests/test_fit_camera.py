@@ -14,7 +14,7 @@ from distrace.data.observation import View
 from distrace.fields import primitives
 from distrace.fields.base import SDF
 from distrace.fitting.alignment import Accuracy, Still, residuals
-from distrace.fitting.fit_camera import CameraConfig, fit_camera
+from distrace.fitting.fit_camera import AGREES_IF_REPEATED, CameraConfig, fit_camera
 from distrace.fitting.visibility import ObservedRays, outline_of, rays_of
 from distrace.pose import pose_error, turned_object, zoomed
 from distrace.render import render, render_rays
@@ -206,6 +206,15 @@ def test_steps_tell_where_the_search_stands() -> None:
     assert steps[0].off > 0.2 > 0.1 > steps[-1].off
     assert [step.evaluations for step in steps] == sorted(step.evaluations for step in steps)
     assert all(step.seconds > 0 for step in steps)
+
+
+def test_a_coarse_view_agrees_with_its_camera_and_with_no_other() -> None:
+    observed = view(size=48, dtype=torch.float32)
+    once = CameraConfig(starts=1)
+    assert list(fit_camera(shape, observed, observed.camera, once))[-1].off < 0.005
+    *_, wrong = fit_camera(shape, observed, turned(observed.camera, 180), once)
+    assert pose_error(wrong.camera, observed.camera)[0] > 5
+    assert wrong.off > AGREES_IF_REPEATED
 
 
 def test_a_view_of_nothing_is_refused() -> None:

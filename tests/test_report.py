@@ -17,6 +17,7 @@ from PIL import Image
 from plotly.offline import get_plotlyjs
 
 from distrace.camera import Camera
+from distrace.data.observation import View
 from distrace.fields.primitives import sphere
 from distrace.fitting.judge import Verdict
 from distrace.metrics import Chamfer
@@ -24,6 +25,7 @@ from distrace.render import render
 from distrace.report import charts, scene
 from distrace.report import page as html
 from distrace.report.completion_page import Completion, RenderedView, completion_page
+from distrace.report.scan_page import ORANGE, input_picture
 
 VOID = {"meta", "link", "img", "br", "path", "use"}
 
@@ -251,6 +253,26 @@ def test_a_mesh_of_many_faces_is_thinned_but_keeps_its_form() -> None:
     corners = np.stack([np.frombuffer(base64.b64decode(drawn[axis]["bdata"]), np.float32) for axis in "xyz"], axis=1)
     assert 10_000 < len(i) <= scene.MOST_FACES
     assert np.abs(np.linalg.norm(corners, axis=1) - 0.7).max() < 0.01
+
+
+def test_the_input_of_a_scan_is_grey_with_its_object_coloured_in_a_frame() -> None:
+    image = torch.linspace(2.0, 4.0, 1000)[:, None].expand(1000, 1300).clone()
+    image[:, :90] = torch.inf
+    alone = torch.full_like(image, torch.inf)
+    alone[300:600, 450:900] = image[300:600, 450:900]
+    camera = Camera.orbit(30, 20, 3.0, height=1000, width=1300)
+    picture = input_picture(image, View(camera, alone))
+    assert max(picture.shape) <= 640
+    scale = picture.shape[1] / 1300
+    grey = picture.max(-1) == picture.min(-1)
+    top, bottom, left, right = (round(scale * edge) for edge in (300, 600, 450, 900))
+    assert not grey[top + 2 : bottom - 2, left + 2 : right - 2].any(), "the object"
+    assert (picture[bottom + 1, left + 9 : right - 9] == ORANGE).all(), "the frame"
+    assert grey[: top - 5].all()
+    assert (picture[:, : round(scale * 90) - 2] == 255).all(), "no depth"
+    assert picture[: top - 5, left:].min() > 130, "pale"
+    nothing = input_picture(image, View(camera, torch.full_like(image, torch.inf)))
+    assert (nothing.max(-1) == nothing.min(-1)).all()
 
 
 def test_columns_of_numbers_stand_to_the_right_and_columns_with_words_to_the_left() -> None:

@@ -4,9 +4,10 @@ import json
 import shutil
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pytest
@@ -24,7 +25,7 @@ from distrace.data.scan import canonical_scan
 from distrace.fields import primitives
 from distrace.pose import Similarity
 from distrace.viewer.image import LAYERS, Image
-from distrace.viewer.live import LiveView, Shown, TracedField
+from distrace.viewer.live import LiveView, Shown, TracedField, picture_heights
 from distrace.viewer.results import open_scene
 from distrace.viewer.scene import Scene, field_scene
 
@@ -100,6 +101,9 @@ def test_a_folder_without_a_shape_is_refused(tmp_path: Path) -> None:
     (tmp_path / "result.json").write_text("{}")
     with pytest.raises(ValueError, match="holds no shape"):
         open_scene(str(tmp_path))
+    (tmp_path / "result.json").write_text('{"model": "sofas"}')  # as that of `render`
+    with pytest.raises(ValueError, match="holds no shape; give the model, sofas, with --code, or what complete, pose"):
+        open_scene(str(tmp_path))
     (tmp_path / "result.json").write_text("[")
     with pytest.raises(ValueError, match=r"result\.json"):
         open_scene(str(tmp_path))
@@ -136,7 +140,7 @@ class PretendedClient:
 
     def __init__(self) -> None:
         self.client_id = 0
-        self.pictures: list[np.ndarray] = []
+        self.pictures: list[np.ndarray | None] = []
         self.scene = self.camera = self
         self.position = np.array([0.0, 0.0, 4.97])
         self.wxyz = np.array([0.0, 1.0, 0.0, 0.0])  # looks along −z, y up
@@ -147,7 +151,7 @@ class PretendedClient:
     def on_update(self, callback: Callable[[object], None]) -> None:
         self.moved = callback
 
-    def set_background_image(self, picture: np.ndarray, **_: object) -> None:
+    def set_background_image(self, picture: np.ndarray | None, **_: object) -> None:
         self.pictures.append(picture)
 
 
@@ -164,17 +168,40 @@ def test_pictures_get_finer_and_other_layers_are_not_traced_again() -> None:
     reports: list[str] = []
     view = LiveView(client, lambda: shown, reports.append)  # pyright: ignore[reportArgumentType]
     wait_until(lambda: len(client.pictures) == 2)
-    assert [len(picture) for picture in client.pictures] == [64, 128]
-    assert (client.pictures[-1][64, 64] < 240).all(), "the ball is in the middle"
-    assert (client.pictures[-1][2, 2] == 255).all()
+    pictures = [picture for picture in client.pictures if picture is not None]
+    assert [len(picture) for picture in pictures] == [64, 128]
+    assert (pictures[-1][64, 64] < 240).all(), "the ball is in the middle"
+    assert (pictures[-1][2, 2] == 255).all()
     counts = len(reports)
     wait_until(lambda: not view.changed.is_set())
     shown = Shown(shown.field, "depth")
     view.changed.set()
     wait_until(lambda: len(reports) > counts)
-    view.close()
-    assert [len(picture) for picture in client.pictures] == [64, 128, 128]
+    assert [None if picture is None else len(picture) for picture in client.pictures] == [64, 128, 128]
     assert " s  " not in reports[-1], "no time was spent on tracing"
+    shown = Shown(shown.field, "depth", mesh=True)
+    view.changed.set()
+    wait_until(lambda: client.pictures[-1] is None)
+    view.close()
+
+
+def test_the_last_picture_is_as_sharp_as_the_browser() -> None:
+    assert picture_heights(900) == [64, 128, 512, 900]
+    assert picture_heights(600) == [64, 128, 600]
+    assert picture_heights(10) == [64]
+    assert picture_heights(4000)[-1] == 1024
+
+
+@pytest.mark.parametrize("aspect", [0.2, 0.46, 0.75, 1.0, 2.0])
+def test_the_first_camera_sees_the_whole_unit_sphere(aspect: float) -> None:
+    pytest.importorskip("viser")
+    from distrace.viewer.viewer import EYE, FIELD_OF_VIEW, framing_position
+
+    position = framing_position(aspect)
+    half_across = np.arctan(np.tan(FIELD_OF_VIEW / 2) * min(aspect, 1))
+    assert np.arcsin(1 / np.linalg.norm(position)) < half_across
+    assert_allclose(np.cross(position, EYE), 0, atol=1e-9)
+    assert (position == EYE) == (aspect >= 1)
 
 
 def test_a_field_that_raises_becomes_a_sentence() -> None:
@@ -201,7 +228,7 @@ def viewer(tmp_path: Path) -> Iterator["Viewer"]:
 
 
 @pytest.mark.slow
-def test_saves_what_is_shown_and_a_page_without_a_server(viewer, tmp_path: Path) -> None:
+def test_saves_what_is_shown_and_says_what_it_does(viewer, tmp_path: Path) -> None:
     assert viewer.address.startswith("http://127.0.0.1:")
     viewer.set_layer("depth")
     assert viewer.save(None) == tmp_path / "saved" / "saved-1"
@@ -209,8 +236,9 @@ def test_saves_what_is_shown_and_a_page_without_a_server(viewer, tmp_path: Path)
     again = open_scene(str(tmp_path / "saved" / "saved-1"))
     assert again.code is not None
     assert again.code.equal(viewer.scene.code)
-    viewer.save_page(tmp_path / "page.html")
-    assert "<html" in (tmp_path / "page.html").read_text()[:2000].lower()
+    steps: list[str] = []
+    viewer.save(None, steps.append)
+    assert steps == ["extracting the mesh, 256 cells along each side …"]
 
 
 def test_the_last_choice_is_what_stays(viewer: "Viewer") -> None:
@@ -230,9 +258,21 @@ def test_the_last_choice_is_what_stays(viewer: "Viewer") -> None:
     assert controls.message.content == "That failed: 'absent'"
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
-def test_the_page_shows_the_shape_and_asks_nobody_else(viewer, size: tuple[int, int]) -> None:
+def test_the_mesh_takes_the_place_of_the_picture(viewer: "Viewer") -> None:
+    controls = viewer.controls
+    scene = viewer.server.scene
+    for layer in ("mesh", "depth", "mesh", "normal"):
+        controls.layer.value = layer
+        controls.worker.submit(lambda: None).result(60)
+        mesh = scene.get_handle_by_name("/mesh")
+        assert mesh is not None
+        assert mesh.visible == viewer.shown.mesh == (layer == "mesh")
+    assert viewer.shown.layer == "normal"
+
+
+@contextmanager
+def browser_page(size: tuple[int, int]) -> Iterator[Any]:
+    """Opens a page of Chromium, of a width and a height; skips the test where there is no Chromium."""
     api = pytest.importorskip("playwright.sync_api")
     chromium = shutil.which("chromium")
     if chromium is None:
@@ -240,14 +280,34 @@ def test_the_page_shows_the_shape_and_asks_nobody_else(viewer, size: tuple[int, 
     with api.sync_playwright() as playwright:
         flags = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         browser = playwright.chromium.launch(executable_path=chromium, args=flags)
-        page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+        yield browser.new_page(viewport={"width": size[0], "height": size[1]})
+        browser.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+def test_a_page_without_a_server_shows_the_whole_shape(viewer, size: tuple[int, int], tmp_path: Path) -> None:
+    viewer.save_page(tmp_path / "page.html")
+    with browser_page(size) as page:
+        page.goto((tmp_path / "page.html").as_uri())
+        page.wait_for_timeout(8000)
+        pixels = screenshot(page)
+    row = (pixels[size[1] // 3 :].mean(-1) < 200).any(axis=0)
+    assert row.mean() > 0.2, "a sofa is seen"
+    assert not row[:4].any()
+    assert not row[-4:].any()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("size", [(1280, 800), (390, 844)], ids=["desktop", "phone"])
+def test_the_page_shows_the_shape_and_asks_nobody_else(viewer, size: tuple[int, int]) -> None:
+    with browser_page(size) as page:
         requests: list[str] = []
         page.on("request", lambda request: requests.append(request.url))
         page.goto(viewer.address)
         wait_for(page, lambda: "pixels" in viewer.controls.status.content)
         page.wait_for_timeout(1000)
         pixels = screenshot(page)
-        browser.close()
     dark = (pixels[: size[1] // 2].mean(-1) < 200).mean()
     assert dark > 0.02, "a sofa is in the upper half"
     own = ("http://127.0.0.1:", "ws://127.0.0.1:", "blob:http://127.0.0.1:", "data:")

@@ -6,8 +6,9 @@ import re
 import signal
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, redirect_stderr
+from contextlib import contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, make_dataclass
+from pathlib import Path
 from threading import current_thread, main_thread
 from typing import Any
 
@@ -75,6 +76,8 @@ COMMANDS: Commands = {
 
 ABOUT = "Render neural signed distance functions, and fit them to observations. Results go to the folder --out."
 INTERRUPTED = "interrupted"
+# Options that a command's memory grows with:
+GROWING = ("size", "sizes", "resolution", "samples", "rays", "width", "samples_per_step")
 RESUMABLE = ("sample", "train", "cameras", "reconstruct")  # commands that continue when run again
 
 
@@ -93,7 +96,8 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
         interrupted = f"{INTERRUPTED}; every written file is complete"
         if sys.argv[1] in RESUMABLE:
             interrupted += f", and {sys.argv[1]} continues when run again"
-        command.run()
+        with _without_empty_folders(getattr(command, "out", None)):
+            command.run()
         sys.stdout.flush()
     except KeyboardInterrupt:
         _end(program, interrupted, 130)
@@ -104,7 +108,7 @@ def run_commands(commands: Commands, program: str, about: str) -> None:
     except (MemoryError, RuntimeError) as error:
         if not _out_of_memory(error):
             raise
-        _end(program, "not enough memory; use a smaller size, or another device", 2)
+        _end(program, f"not enough memory{_sizes(command)}; use a smaller size, or another device", 2)
 
 
 def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "distrace", about: str = ABOUT) -> Any:
@@ -134,6 +138,19 @@ def parsed(arguments: list[str], commands: Commands = COMMANDS, program: str = "
     if seed is not None and not 0 <= seed < 2**31:
         raise ValueError(f"--seed {seed} was given; a number from 0 to {2**31 - 1} is needed")
     return command
+
+
+@contextmanager
+def _without_empty_folders(out: Path | None) -> Iterator[None]:
+    """Where a command fails, removes the folders on the way to `out` that it made, if it wrote nothing there."""
+    made = [] if out is None else [folder for folder in (out, *out.parents) if not folder.exists()]
+    try:
+        yield
+    except BaseException:
+        for folder in made:
+            with suppress(OSError):  # it holds something, or was not made
+                folder.rmdir()
+        raise
 
 
 def discard_output() -> None:
@@ -170,6 +187,17 @@ def _out_of_memory(error: Exception) -> bool:
     import torch
 
     return isinstance(error, MemoryError | torch.OutOfMemoryError) or "allocate memory" in str(error)
+
+
+def _sizes(command: Any) -> str:
+    """Returns the options that a command's memory grows with, and their values."""
+    given: list[str] = []
+    for name in GROWING:
+        value = getattr(command, name, ())
+        numbers = value if isinstance(value, tuple) else (value,)
+        if numbers and all(isinstance(number, int) for number in numbers):
+            given.append(f"--{name.replace('_', '-')} {' '.join(map(str, numbers))}")
+    return f" for {' '.join(given)}" if given else ""
 
 
 def _one_line(box: str) -> str:

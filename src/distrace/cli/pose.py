@@ -16,7 +16,7 @@ from distrace.cli.common import NONE, CodeName, Flag, ModelName, Orbit, check_di
 from distrace.cli.console import Run, progress, start
 from distrace.data.observation import View, read_view, save_view
 from distrace.fields.base import SDF
-from distrace.fitting.fit_camera import CameraConfig, CameraStep, fit_camera
+from distrace.fitting.fit_camera import AGREES_IF_REPEATED, CameraConfig, CameraStep, fit_camera
 from distrace.pose import pose_error
 from distrace.render import render
 
@@ -95,6 +95,10 @@ class Pose:
             "iterations": len(steps),
             "evaluations": last.evaluations,
         }
+        if last.off > AGREES_IF_REPEATED:
+            run.warn(
+                f"the camera is doubtful, for {last.off:.0%} of the rays disagree; try more --starts or another --code"
+            )
         degrees, percent = pose_error(last.camera, observed.camera)
         focal = 100 * abs(float(last.camera.intrinsics[0, 0] / observed.camera.intrinsics[0, 0]) - 1)
         facts |= {"degrees_from_observation": degrees, "percent_from_observation": percent}

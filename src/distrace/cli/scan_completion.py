@@ -22,7 +22,7 @@ from distrace.metrics import chamfer
 from distrace.pose import Similarity
 from distrace.prior import prior_of
 from distrace.report.mesh_picture import mesh_picture
-from distrace.report.scan_page import scan_page
+from distrace.report.scan_page import input_picture, scan_page
 
 if TYPE_CHECKING:
     import trimesh
@@ -62,7 +62,7 @@ def complete_scan(run: Run, task: ScanTask) -> Verdict:
     with run.optional("report.html"):
         content = scan_page(
             verdict=fit.verdict,
-            observed=[shading.depth_picture(view.depth) for view in task.scan.views],
+            observed=[input_picture(*each) for each in zip(task.scan.images, task.scan.views)],
             pictures=pictures,
             mesh=mesh,
             points=task.scan.points.cpu().numpy(),

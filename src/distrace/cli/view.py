@@ -45,6 +45,7 @@ class ViewShape:
         viewer = Viewer(scene, self.out, self.port)
         try:
             if self.save is not None:
+                console.print(f"extracting the mesh of {scene.title} …", soft_wrap=True)
                 viewer.save_page(self.save)
                 run.finish({"shown": self.shown, "page": str(self.save)}, f"wrote {self.save}")
                 return

@@ -37,6 +37,7 @@ class Scan:
     ups: Float[Tensor, "k 3"]
     tilt: float = GIVEN_TILT  # standard deviation, in radians
     views: tuple[View, ...] = ()  # cameras, depths and masks of the object alone
+    images: tuple[Float[Tensor, "_ _"], ...] = ()  # the depths of each view as they were read, on the CPU
 
     @property
     def centre(self) -> Float[Tensor, "3"]:
@@ -73,8 +74,9 @@ def joined(scans: Sequence[Scan]) -> Scan:
     hits = Rays.cat([scan.hits for scan in scans])
     free_until = torch.cat([scan.free_until for scan in scans])
     views = tuple(view for scan in scans for view in scan.views)
+    images = tuple(image for scan in scans for image in scan.images)
     first = scans[0]
-    return Scan(points, free, free_until, hits, noise_of(points), first.ups, first.tilt, views)
+    return Scan(points, free, free_until, hits, noise_of(points), first.ups, first.tilt, views, images)
 
 
 def scan_of_view(scene: View, mask: Bool[Tensor, "height width"] | None, up: Up, isolate: bool = False) -> Scan:
@@ -103,7 +105,7 @@ def scan_of_object(found: SegmentedView) -> Scan:
         below = rays_below(found.floor, found.points)
         rays = Rays.cat([rays, below])
         until = torch.cat([until, torch.full((len(below.origins),), torch.inf)])
-    return _scan(found.points, rays, until, hit_rays, found.up, (view,))
+    return replace(_scan(found.points, rays, until, hit_rays, found.up, (view,)), images=(scene.depth.cpu(),))
 
 
 def _rays(

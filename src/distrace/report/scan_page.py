@@ -5,13 +5,15 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
+from torch import Tensor
 
+from distrace.data.observation import View
 from distrace.fitting.judge import Verdict
 from distrace.pose import Similarity
 from distrace.report.charts import starts_section
 from distrace.report.page import facts_section, figure, page, paragraph, row, section, table, verdict_banner
 from distrace.report.scene import surfaces_section
-from distrace.shading import Picture
+from distrace.shading import Picture, depth_picture
 
 if TYPE_CHECKING:
     import trimesh
@@ -20,9 +22,35 @@ ABOUT_VERDICT = (
     "A verdict comes from the input alone. A part that nothing was seen of may still be wrong: there the shape is what"
     " the model takes to be likely."
 )
+ABOUT_INPUT = "The input: the object that was completed in colours, by depth, with a frame; everything else in grey"
+LONGEST = 640  # pixels along the longer side of an input's picture, at most
+PALE = 0.4  # of the full contrast, of what is not the object
+FRAME = 2  # pixels, of the rectangle's width
+ORANGE = (226, 112, 32)
 ABOUT_PLACEMENT = (
     "T_input_object takes points of the model's unit sphere to the input's frame; `placement.json` holds it."
 )
+
+
+def input_picture(image: Float[Tensor, "height width"], view: View) -> Picture:
+    """Returns a whole depth image in pale grey, its object in colours, and a rectangle around that.
+
+    Of a large image only some rows and columns are drawn.
+    """
+    step = -(-max(image.shape) // LONGEST)
+    depth = view.depth[::step, ::step]
+    inside = depth.isfinite().cpu().numpy()
+    scene = depth_picture(image[::step, ::step])
+    picture = np.repeat(255 - (255 - scene.mean(-1, keepdims=True)) * PALE, 3, axis=-1).astype(np.uint8)
+    picture[inside] = depth_picture(depth)[inside]
+    rows, columns = inside.nonzero()
+    if rows.size:
+        top, left = max(rows.min() - FRAME, 0), max(columns.min() - FRAME, 0)
+        framed = np.zeros_like(inside)
+        framed[top : rows.max() + FRAME + 1, left : columns.max() + FRAME + 1] = True
+        framed[top + FRAME : rows.max() + 1, left + FRAME : columns.max() + 1] = False
+        picture[framed & ~inside] = ORANGE
+    return picture
 
 
 def scan_page(
@@ -39,11 +67,11 @@ def scan_page(
 ) -> str:
     """Returns the page as HTML.
 
-    `observed` are the depths of each view; `pictures` the completion, by where it is seen from; `mesh`, `points`
-    and `truth` lie in the input's frame; `losses` are those of each start, the best first; `origin` is the model, the
-    command and the version.
+    `observed` are the `input_picture` of each view; `pictures` the completion, by where it is seen from; `mesh`,
+    `points` and `truth` lie in the input's frame; `losses` are those of each start, the best first; `origin` is the
+    model, the command and the version.
     """
-    inputs = [figure(picture, "The observed depth of the object") for picture in observed]
+    inputs = [figure(picture, ABOUT_INPUT) for picture in observed]
     shapes = [figure(picture, f"The completion from {name}") for name, picture in pictures.items()]
     evidence = [
         ("points near the surface", f"{verdict.explained:.1%}"),

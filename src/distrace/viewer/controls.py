@@ -22,6 +22,7 @@ DIRECTIONS = 6  # of the prior, the leading ones, that have a slider
 REACH = 3.0  # of a slider to both sides, in standard deviations of the training shapes
 LIGHT = (-0.9, 1.1, 1.0)  # radii: where the light's handle is at first
 NOTHING = "–"
+MESH = "mesh"  # a choice beside the layers
 
 
 class Controls:
@@ -36,11 +37,9 @@ class Controls:
         gui = viewer.server.gui
         self.title = gui.add_markdown(f"**{scene.title}**")
         self.status = gui.add_markdown("")
-        layer = gui.add_dropdown("layer", tuple(LAYERS))
-        layer.on_update(lambda _: viewer.set_layer(layer.value))
+        self.layer = gui.add_dropdown("layer", (*LAYERS, MESH))
+        self.layer.on_update(lambda _: self._change_layer())
         self._add_light()
-        self.mesh = gui.add_checkbox("mesh", False)
-        self.mesh.on_update(lambda _: self._renew_mesh())
         for label, name in (("observed points", "/points"), ("cameras", "/cameras")):
             self._add_switch(label, name)
         if scene.model is not None:
@@ -142,7 +141,7 @@ class Controls:
         self.viewer.set_code(code, title)
         self.title.content = f"**{title}**"
         self._set_sliders()
-        if self.mesh.value:
+        if self.layer.value == MESH:
             self._renew_mesh()
 
     def _set_sliders(self) -> None:
@@ -151,16 +150,27 @@ class Controls:
         for slider, value in zip(self.sliders, self.prior.coordinates(code).tolist(), strict=False):
             slider.value = round(min(max(value, -REACH), REACH), 2)
 
+    def _change_layer(self) -> None:
+        """Shows a traced layer at once, and the mesh when it is made."""
+        if self.layer.value == MESH:
+            self._renew_mesh()
+        else:
+            self.viewer.set_layer(self.layer.value)
+
     def _renew_mesh(self) -> None:
         """Has the mesh made again, once for all changes that are waiting."""
         if self.mesh_due.is_set():
             return
         self.mesh_due.set()
+        self.report("extracting the mesh …")
         self._submit(self._make_mesh)
 
     def _make_mesh(self) -> None:
         self.mesh_due.clear()
-        self.viewer.set_mesh(self.mesh.value)
+        if self.layer.value == MESH:
+            self.viewer.set_mesh()
+        if self.layer.value != MESH:  # another was chosen meanwhile
+            self.viewer.set_layer(self.layer.value)
 
     def _refit(self) -> None:
         scene = self.viewer.scene
@@ -176,10 +186,12 @@ class Controls:
         self.message.content = f"fitting: {done} of {total}"
 
     def _save(self, event: "GuiEvent") -> None:
-        self.message.content = "saving …"
+        def report(text: str) -> None:
+            self.message.content = f"saving: {text}"
+
         self.saving = True
         try:
-            folder = self.viewer.save(None if event.client is None else event.client.camera)
+            folder = self.viewer.save(None if event.client is None else event.client.camera, report)
         finally:
             self.saving = False
         self.message.content = f"wrote {folder.resolve()}"

@@ -20,8 +20,12 @@ from distrace.viewer.scene import Scene
 if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
-HEIGHTS = (64, 128, 256, 512)  # rows of the pictures, one after the other, while nothing moves
+HEIGHTS = (64, 128, 512)  # rows of the pictures, one after the other, while nothing moves; at last the browser's own
+MOST_ROWS = 1024
+SHARPER = 1.5  # times as many rows as the picture before; for fewer a picture is not worth its time
 FAR = 100.0  # depth of the background in radii: behind everything
+MESH_CELLS = 96  # along each side, of the mesh on the page
+MESH_LEGEND = f"a mesh by marching cubes, {MESH_CELLS} cells along each side"
 TRACING = Lock()  # one band at a time: each uses all cores
 
 
@@ -52,6 +56,7 @@ class Shown:
     field: TracedField
     layer: str = SHADED
     light: Light = None
+    mesh: bool = False  # instead of a traced picture: both on one page would hide parts of each other
 
     @torch.no_grad()
     def picture(self, image: Image) -> tuple[Picture, str]:
@@ -70,6 +75,12 @@ def browser_camera(handle: "CameraHandle", height: int) -> Camera:
     pose[:3, 3] = torch.from_numpy(np.array(handle.position))
     intrinsics = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
     return Camera.from_matrices(intrinsics, pose, height, width)
+
+
+def picture_heights(rows: int) -> list[int]:
+    """Returns the rows of each picture of a browser with so many rows of pixels, the coarsest first."""
+    most = min(max(rows, HEIGHTS[0]), MOST_ROWS)
+    return [*(height for height in HEIGHTS if height * SHARPER <= most), most]
 
 
 class LiveView:
@@ -104,7 +115,11 @@ class LiveView:
     def _draw(self) -> None:
         """Sends ever finer pictures until anything moves; draws the last one again where only its colours change."""
         shown = self.shown()
-        heights = [height for height in HEIGHTS if height <= max(self.client.camera.image_height, HEIGHTS[0])]
+        if shown.mesh:
+            self.client.scene.set_background_image(None)
+            self.report(MESH_LEGEND)
+            return
+        heights = picture_heights(self.client.camera.image_height)
         if self.finished is not None:
             field, camera, image = self.finished
             if field is shown.field and camera == browser_camera(self.client.camera, camera.height):

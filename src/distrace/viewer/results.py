@@ -27,7 +27,7 @@ from distrace.viewer.scene import Progress, Refit, Scene, model_scene
 
 
 def open_scene(name: str, code: str | None = None, device: str | torch.device = "cpu") -> Scene:
-    """Opens a bundled model, a folder of a model, or the `--out` folder of another command.
+    """Opens a bundled model, a folder of a model, or the `--out` folder of complete, pose, multiview or reconstruct.
 
     `code` is a shape of a model: its number, its name, or a `code.npy`; by default the first. Raises `ValueError`, in
     one sentence, for anything else.
@@ -51,8 +51,11 @@ def _result(folder: Path, device: torch.device) -> Scene:
         return _reconstruction(folder, content, device)
     if (folder / "code.npy").is_file() and name is None:
         raise ValueError(f"{path} names no model, as those of earlier versions; run its command again")
-    if name is None:
-        raise ValueError(f"{folder} holds no shape; give a model, or what complete, pose or multiview wrote")
+    if name is None or not (folder / "code.npy").is_file():
+        instead = "a model" if name is None else f"the model, {name}, with --code"
+        raise ValueError(
+            f"{folder} holds no shape; give {instead}, or what complete, pose, multiview or reconstruct wrote"
+        )
     model = load_model(name).to(device)
     code = named_code(model, str(folder / "code.npy"))
     scene = model_scene(model, code, f"{folder.name}, a shape of {model.name}", name)

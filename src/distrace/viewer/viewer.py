@@ -1,5 +1,6 @@
 """The page: a server on loopback, what it shows, and what it saves."""
 
+import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -18,7 +19,7 @@ from distrace.mesh import MeshConfig, extract_mesh, mesh_in_world, save_mesh
 from distrace.optional import require
 from distrace.shading import save_png
 from distrace.viewer.image import Light
-from distrace.viewer.live import TRACING, LiveView, Shown, TracedField, browser_camera
+from distrace.viewer.live import MESH_CELLS, TRACING, LiveView, Shown, TracedField, browser_camera
 from distrace.viewer.scene import Scene
 
 if TYPE_CHECKING:
@@ -26,15 +27,32 @@ if TYPE_CHECKING:
     from viser import CameraHandle, ClientHandle
 
 HOST = "127.0.0.1"  # only this machine can open the page
-EYE = (2.35, 1.7, 4.05)  # of the first camera, in radii
+EYE = (2.35, 1.7, 4.05)  # of the first camera, in radii, in a window that is not narrow
 FIELD_OF_VIEW = 0.52  # radians, from the bottom to the top
-MESH_CELLS = 96  # along each side, of the mesh on the page …
-SAVED_CELLS = 256  # … and of the one that is saved
+MARGIN = 1.05  # radii of the sphere about the shape that the first camera sees
+SAVED_CELLS = 256  # along each side, of the mesh that is saved
 SAVED_ROWS = 512  # of the saved picture
 BLUE = (44, 104, 190)
 POINT_SIZE = 0.012  # radii, of an observed point
 ORANGE = (226, 112, 32)
 CLAY = (203, 192, 180)
+
+
+# In a page without a server: the same as `framing_position`. The client reads the first camera from the address.
+FRAMED_SCRIPT = f"""<script>{{
+const eye = {list(EYE)};
+const half = Math.atan(Math.tan({FIELD_OF_VIEW} / 2) * innerWidth / innerHeight);
+const scale = {MARGIN} / Math.sin(half) / Math.hypot(...eye);
+if (scale > 1) history.replaceState(null, "", "?initialCameraPosition=" + eye.map(x => scale * x));
+}}</script>"""
+
+
+def framing_position(aspect: float) -> tuple[float, float, float]:
+    """Returns where the first camera is: at `EYE`, or farther where a narrow window would cut the unit sphere."""
+    half = math.atan(math.tan(FIELD_OF_VIEW / 2) * aspect)
+    scale = max(1.0, MARGIN / math.sin(half) / math.hypot(*EYE))
+    x, y, z = EYE
+    return (scale * x, scale * y, scale * z)
 
 
 @contextmanager
@@ -92,8 +110,8 @@ class Viewer:
             self.server.stop()
 
     def set_layer(self, layer: str) -> None:
-        """Shows another layer in all browsers."""
-        self._show(lambda shown: replace(shown, layer=layer))
+        """Shows a traced layer in all browsers."""
+        self._show(lambda shown: replace(shown, layer=layer, mesh=False))
 
     def set_light(self, light: Light) -> None:
         """Shows the shape in the light from a direction; None: over the camera's shoulder."""
@@ -106,26 +124,26 @@ class Viewer:
         moved = replace(scene, title=title, code=code, sdf=scene.model.field(code))
         self._show(lambda shown: replace(shown, field=TracedField(moved)))
 
-    def set_mesh(self, visible: bool) -> None:
-        """Adds the mesh of what is shown to the page, or takes it away."""
-        if not visible:
-            self.server.scene.remove_by_name("/mesh")
-            return
+    def set_mesh(self) -> None:
+        """Shows the mesh of the shape in all browsers, instead of a traced layer."""
         mesh = _mesh(self.scene, MESH_CELLS)
         self.server.scene.add_mesh_simple("/mesh", np.asarray(mesh.vertices), np.asarray(mesh.faces), color=CLAY)
+        self._show(lambda shown: replace(shown, mesh=True))
 
-    def save(self, handle: "CameraHandle | None") -> Path:
+    def save(self, handle: "CameraHandle | None", report: Callable[[str], None] = lambda _: None) -> Path:
         """Writes the mesh, the code, its placement, and the picture of a browser's camera into a new folder.
 
-        The mesh is in the frame of the input, and the folder can be opened again.
+        The mesh is in the frame of the input, and the folder can be opened again. `report` takes what is being done.
         """
         shown = self.shown
         scene = shown.field.scene
         folder = _fresh(self.out)
+        report(f"extracting the mesh, {SAVED_CELLS} cells along each side …")
         save_mesh(folder / "mesh.ply", mesh_in_world(_mesh(scene, SAVED_CELLS), scene.place))
         if scene.code is not None:
             save_code(folder, scene.code, scene.place)
         if handle is not None:
+            report("tracing the picture …")
             picture, _ = shown.picture(shown.field.image(browser_camera(handle, SAVED_ROWS)))
             save_png(folder / "picture.png", picture)
         save_json(folder / "result.json", {"model": scene.source, "title": scene.title})
@@ -133,12 +151,16 @@ class Viewer:
 
     def save_page(self, path: str | Path) -> None:
         """Writes a page that needs no server: the mesh, the observed points and the cameras."""
-        self.set_mesh(True)
-        save_text(path, self.server.scene.as_html())
+        self.set_mesh()
+        page = self.server.scene.as_html()
+        save_text(path, page.replace("</head>", f"{FRAMED_SCRIPT}</head>", 1))
 
     def _show(self, change: Callable[[Shown], Shown]) -> None:
         with self.changing:
             self.shown = change(self.shown)
+            mesh = self.server.scene.get_handle_by_name("/mesh")
+            if mesh is not None:
+                mesh.visible = self.shown.mesh
         for view in list(self.views.values()):
             view.changed.set()
 
@@ -175,10 +197,10 @@ class Viewer:
         )
 
     def _connected(self, client: "ClientHandle") -> None:
-        aspect = client.camera.aspect
-        if aspect < 1:  # a phone: from so far that the whole shape is seen
-            client.camera.position = np.array(self.server.initial_camera.position) / aspect
-            client.camera.look_at = np.zeros(3)
+        position = framing_position(client.camera.aspect)
+        if position != EYE:
+            client.camera.position = position
+            client.camera.look_at = (0.0, 0.0, 0.0)
         view = LiveView(client, lambda: self.shown, self.controls.report)
         self.views[client.client_id] = view
         if client.client_id not in self.server.get_clients():  # it left meanwhile
