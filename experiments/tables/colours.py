@@ -1,7 +1,7 @@
 """Colours of held-out textured shapes from photographs, against Mitsuba's renderings of the truth.
 
 Photographs, new views and new lights are rendered by a path tracer, with shadows and light between surfaces, which our
-lights do not have. Differences count where the true shape or the fitted one is seen.
+lights do not have. The shape comes from the silhouettes; it is placed as its class.
 """
 
 import math
@@ -20,17 +20,16 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoints.colours import Colours, load_colours
 from distrace.checkpoints.model import Model
-from distrace.cli.multiview_colours import shape_of_silhouette
+from distrace.cli.multiview_colours import shape_of_silhouettes
 from distrace.colour_space import to_linear, to_srgb
 from distrace.data.patches import Patch, in_unit_sphere, load_patches
 from distrace.data.photograph import Photograph
 from distrace.fields.colour import Albedo
 from distrace.files import save_json
+from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.fit_colours import ColourFitConfig, fit_colours, fitted_light
 from distrace.lights import Ambient, Directional, Light, SphericalHarmonics, lit, white_in_harmonics
-from distrace.photos.fit_photos import KNOWN_PLACE, fit_photos
 from distrace.pose import Similarity
-from distrace.prior import prior_of
 from distrace.render import Buffers, render
 from distrace.shading import Picture, colour_picture, grid, save_png
 from distrace.viewpoint import orbiting
@@ -97,7 +96,7 @@ def coloured(place: Place, trial: ColourTrial) -> tuple[ColourTrial, list[Agreem
     colours = load_colours(dict(place.models)[trial.category])
     if colours is None:
         raise ValueError(f"{model.name} has no colours; `distrace train --colour` adds some")
-    mark = fingerprint(model, SIZE, SAMPLES, KNOWN_PLACE, ColourFitConfig(), network=colours.decoder)
+    mark = fingerprint(model, SIZE, SAMPLES, CodeFitConfig(), ColourFitConfig(), network=colours.decoder)
     if path.is_file():
         content = read_json(path)
         if content["made_by"] == mark:
@@ -199,11 +198,7 @@ class ColouredShape:
 
 def _fitted(model: Model, colours: Colours, photographs: Sequence[Photograph]) -> list[ColouredShape]:
     """Returns the shape by each method."""
-    prior = prior_of(model.codes)
-    if len(photographs) == 1:
-        last = shape_of_silhouette(model, photographs[0]).last
-    else:
-        last = fit_photos(model.decoder, photographs, prior, KNOWN_PLACE).last
+    last = shape_of_silhouettes(model, photographs).last
     fit = fit_colours(colours, photographs, model.field(last.code), last.code, last.place)
     albedo = colours.decoder.albedo(last.code, fit.colour_code)
     ours = ColouredShape(last.code, last.place, albedo, fit.light_of(0))

@@ -12,7 +12,7 @@ from distrace.checkpoints.colours import colours_of
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, Format, ModelName, Views, check_formats, opened_for, save_meshes
 from distrace.cli.console import console, progress, start
-from distrace.cli.multiview_colours import find_colours, shape_of_silhouette
+from distrace.cli.multiview_colours import find_colours, shape_of_silhouettes
 from distrace.coloured import coloured_mesh
 from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
@@ -75,7 +75,7 @@ class Multiview:
         comparison = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
         config = replace(usual, starts=self.starts, seed=self.seed, comparison=comparison)
         colours = colours_of(model, self.model) if self.colour else None
-        fit = shape_of_silhouette(model, views[0]) if len(views) == 1 and self.fixed else _fitted(model, views, config)
+        fit = shape_of_silhouettes(model, views) if len(views) == 1 and self.fixed else _fitted(model, views, config)
         last = fit.last
         coloured = None
         albedo = None

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 
 from distrace.checkpoints.colours import Colours
 from distrace.checkpoints.model import Model
@@ -17,14 +18,16 @@ from distrace.pose import Similarity
 from distrace.prior import prior_of
 
 
-def shape_of_silhouette(model: Model, photograph: Photograph) -> PhotoFit:
-    """Returns the shape of one photograph with a mask, placed as the model's shapes are.
+def shape_of_silhouettes(model: Model, photographs: Sequence[Photograph]) -> PhotoFit:
+    """Returns the shape of photographs with masks, placed as the model's shapes are.
 
-    Raises `ValueError` without a mask.
+    Raises `ValueError` for a photograph without a mask.
     """
-    mask = photograph.known_mask
-    depth = photograph.image.new_full(mask.shape, float("inf"))
-    fit = fit_code(model.decoder, [View(photograph.camera, depth, mask)], prior_of(model.codes))
+    views = []
+    for photograph in photographs:
+        mask = photograph.known_mask
+        views.append(View(photograph.camera, photograph.image.new_full(mask.shape, torch.inf), mask))
+    fit = fit_code(model.decoder, views, prior_of(model.codes))
     step = PhotoStep(0, 1, fit.loss, {"outline": fit.loss}, fit.code, Similarity.identity().to(fit.code.device))
     return PhotoFit([step], fit.evaluations)
 
