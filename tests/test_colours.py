@@ -5,18 +5,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+import trimesh
+from PIL import Image
 from torch import Tensor
 
 from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoints.colours import Colours, colours_of, load_colours, named_albedo, save_colours
-from distrace.checkpoints.model import load_model
+from distrace.checkpoints.model import Model, load_model, save_model
+from distrace.cli import main
+from distrace.cli.train import Train
 from distrace.colour_space import to_srgb
 from distrace.coloured import coloured_mesh, coloured_picture, studio
 from distrace.data.coloured_points import ColouredPoints, coloured_points
 from distrace.data.photograph import Photograph
 from distrace.fields import primitives
 from distrace.fields.colour import ColourDecoder, ColourSpecs
+from distrace.fields.decoder import Decoder, NetworkSpecs
 from distrace.fitting.fit_colours import ColourFitConfig, fit_colours
 from distrace.lights import SphericalHarmonics, lit
 from distrace.mesh import MeshConfig, extract_mesh
@@ -84,7 +89,7 @@ def test_training_learns_each_palette() -> None:
     config = ColourTrainConfig(steps=120, palettes=1, palettes_per_step=4, learning_rate=1e-2, specs=SMALL)
     training = start_colours(2, config, torch.device("cpu"))
     codes = torch.eye(4)[:2]
-    losses = [step.loss for step in train_colours(training, samples, codes, config)]
+    losses = list(train_colours(training, samples, codes, config))
     assert losses[-1] < 0.3 * losses[0]
     right = torch.tensor([[0.8, 0.0, 0.0]])
     found = training.decoder(right, right / 0.8, codes, training.codes)
@@ -176,3 +181,54 @@ def test_pictures_and_meshes_have_the_colours() -> None:
     mesh = coloured_mesh(extract_mesh(model.field(code), MeshConfig(24)), albedo)
     shown = np.asarray(mesh.visual.vertex_colors)[:, :3].mean(0)
     assert shown[2] > shown[0] + 20
+
+
+def test_colours_of_vertices_and_of_glb_textures_are_read(tmp_path: Path) -> None:
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.ColorVisuals(box, vertex_colors=np.tile([255, 0, 0, 255], (8, 1)))
+    box.export(tmp_path / "vertices.ply")
+    assert np.allclose(coloured_points(tmp_path / "vertices.ply", 0.0, 50).colours, [1, 0, 0])
+
+    image = Image.new("RGB", (8, 8), (0, 255, 0))
+    image.putpixel((0, 0), (0, 200, 0))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=image)
+    box = trimesh.creation.box()
+    box.visual = trimesh.visual.TextureVisuals(uv=np.full((8, 2), 0.5), material=material)
+    box.export(tmp_path / "textured.glb")
+    assert np.allclose(coloured_points(tmp_path / "textured.glb", 0.0, 50).colours, [0, 1, 0])
+
+
+def test_the_command_adds_colours_to_a_model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    meshes = tmp_path / "meshes"
+    meshes.mkdir()
+    cube(meshes)
+    decoder = Decoder(NetworkSpecs(dims=(16, 16), code_length=4, latent_in=(), norm_layers=()))
+    save_model(tmp_path / "model", Model("model", decoder, torch.zeros(1, 4), ("cube",)))
+    out = tmp_path / "out"
+    arguments = ["train", str(meshes), "--colour", "--begin-with", str(tmp_path / "model"), "--steps", "2"]
+    monkeypatch.setattr("sys.argv", ["distrace", *arguments, "--out", str(out)])
+    main()
+    assert (out / "preview.png").is_file()
+    model = load_model(out)
+    assert colours_of(model, out).shapes == ("cube",)
+
+    for folder, message in ((tmp_path / "model", "is the folder of --begin-with"), (tmp_path / "run", "holds a run")):
+        folder.mkdir(exist_ok=True)
+        (folder / "checkpoint.pt").touch()
+        command = Train(meshes, folder, begin_with=str(tmp_path / "model"), colour=True)
+        with pytest.raises(ValueError, match=message):
+            command.run()
+    with pytest.raises(ValueError, match="--width was given, which --colour does not use"):
+        Train(meshes, out, begin_with=str(tmp_path / "model"), colour=True, width=8).run()
+
+
+def test_commands_draw_in_colours(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shape = ["sofas", "--code", "convertible-sofa-closed", "--colour", "own", "--out", str(tmp_path)]
+    monkeypatch.setattr("sys.argv", ["distrace", "render", *shape, "--size", "24"])
+    main()
+    picture = np.asarray(Image.open(tmp_path / "shaded.png")).astype(int)
+    assert (picture[..., 2] > picture[..., 0] + 20).sum() > 20
+    monkeypatch.setattr("sys.argv", ["distrace", "mesh", *shape, "--resolution", "16"])
+    main()
+    colours = np.asarray(trimesh.load(tmp_path / "mesh.ply").visual.vertex_colors).astype(int)
+    assert colours[:, 2].mean() > colours[:, 0].mean() + 20

@@ -53,8 +53,20 @@ def test_another_input_or_option_is_computed_anew(tmp_path: Path, other: dict) -
     assert runs(tmp_path) == 2
 
 
+def test_another_model_is_computed_anew(tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    for content in ("a", "b"):
+        weights.write_text(content)
+        first = job(tmp_path)
+        FolderJob(first.path, first.command, (weights,)).run()
+    assert runs(tmp_path) == 2
+
+
 def test_a_refused_input_is_a_row(tmp_path: Path) -> None:
-    assert job(tmp_path, "").run() == {"input": "a.xyz", "verdict": "refused", "reason": "it is empty"}
+    refused = {"input": "a.xyz", "verdict": "refused", "reason": "it is empty"}
+    assert job(tmp_path, "").run() == refused
+    assert job(tmp_path, "").run() == refused
+    assert runs(tmp_path) == 2, "it is tried again: a library may be there now"
 
 
 def test_inputs_are_found_by_their_endings(tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ from distrace.boundary import shade
 from distrace.camera import Camera
 from distrace.checkpoints.colours import Colours, load_colours
 from distrace.checkpoints.model import Model
-from distrace.cli.multiview_colours import shape_of_silhouettes
 from distrace.colour_space import to_linear, to_srgb
 from distrace.data.patches import Patch, in_unit_sphere, load_patches
 from distrace.data.photograph import Photograph
@@ -29,6 +28,7 @@ from distrace.files import save_json
 from distrace.fitting.fit_code import CodeFitConfig
 from distrace.fitting.fit_colours import ColourFitConfig, fit_colours, fitted_light
 from distrace.lights import Ambient, Directional, Light, SphericalHarmonics, lit, white_in_harmonics
+from distrace.photos.silhouettes import shape_of_silhouettes
 from distrace.pose import Similarity
 from distrace.render import Buffers, render
 from distrace.shading import Picture, colour_picture, grid, save_png

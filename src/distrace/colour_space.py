@@ -1,4 +1,4 @@
-"""Linear light, with which is reckoned, and sRGB, as pictures store it (IEC 61966-2-1)."""
+"""Conversion between linear light and sRGB, as pictures store it (IEC 61966-2-1)."""
 
 import torch
 from jaxtyping import Float

@@ -66,8 +66,11 @@ def _on_cluster(work: Callable[[Task], Result], tasks: Sequence[Task], address: 
                 f"--cluster {address} was given, and no Ray cluster answers there; `ray start --head` starts one"
             ) from error
 
+    here = os.getcwd()
+
     def alone(task: Task) -> Result:
         torch.set_num_threads(1)
+        os.chdir(here)  # relative paths mean the same files as here
         return work(task)
 
     remote = ray.remote(num_cpus=1, max_retries=RETRIES)(alone)
@@ -79,6 +82,10 @@ def _on_cluster(work: Callable[[Task], Result], tasks: Sequence[Task], address: 
                 yield ray.get(result)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None  # what the task raised, without the traceback of its machine
+    except ray.exceptions.RayError as error:
+        raise ValueError(
+            f"the cluster at {address} lost a task {RETRIES + 1} times, or itself; see its logs"
+        ) from error
     finally:
         for each in pending:
             ray.cancel(each, force=True)

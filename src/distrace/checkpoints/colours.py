@@ -57,7 +57,8 @@ def load_colours(model: str | Path) -> Colours | None:
         return None
     with error_context(f"{path} does not describe a colour decoder", path):
         content = json.loads(path.read_text(encoding="utf-8"))
-        decoder = ColourDecoder(ColourSpecs(**content["specs"]))
+        with torch.device("meta"):  # the sizes are only believed once the file has weights of them
+            decoder = ColourDecoder(ColourSpecs(**content["specs"]))
         shapes = tuple(str(shape) for shape in content["shapes"])
     weights = folder / WEIGHTS
     with error_context(f"{weights} does not hold the colour decoder that {SPECS} describes", weights):
@@ -65,7 +66,7 @@ def load_colours(model: str | Path) -> Colours | None:
         codes = tensors.pop("codes")
         if any(not tensor.isfinite().all() for tensor in (codes, *tensors.values())):
             raise ValueError("it has values that are not finite")
-        decoder.load_state_dict(tensors)
+        decoder.load_state_dict(tensors, assign=True)
         if codes.dim() != 2 or codes.shape[1] != decoder.specs.colour_code or len(codes) < len(shapes):
             raise ValueError(f"its codes have the shape {list(codes.shape)}")
     return Colours(decoder.eval().requires_grad_(False), codes, shapes)

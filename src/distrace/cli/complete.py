@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import numpy as np
 import tyro
 
+from distrace.checkpoints.model import model_folder
 from distrace.cli.common import NONE, Cluster, Flag, Format, ModelName, default, opened_for
 from distrace.cli.complete_folder import FolderJob, complete_each, inputs_in
 from distrace.cli.completion import COMPLETED, Task, complete
@@ -109,8 +110,15 @@ class Complete:
                 raise ValueError(f"--{name} was given with the folder {folder}, whose files show an object each")
         if self.jobs is not None and self.jobs < 1:
             raise ValueError(f"--jobs {self.jobs} was given; at least one process is needed")
+        if self.out.resolve() == folder.resolve():
+            raise ValueError(f"--out {self.out} is the folder of the inputs; give another")
         alone = replace(self, jobs=None, cluster=None, strict=False)
-        jobs = [FolderJob(path, replace(alone, inputs=(path,), out=run.out / path.name)) for path in inputs_in(folder)]
+        read = [path for path in sorted(model_folder(self.model).rglob("*")) if path.is_file()]
+        if self.intrinsics is not None and Path(self.intrinsics).is_file():
+            read.append(Path(self.intrinsics))
+        jobs = []
+        for path in inputs_in(folder):
+            jobs.append(FolderJob(path, replace(alone, inputs=(path,), out=run.out / path.name), tuple(read)))
         with run_lock(run.out):
             failed = complete_each(run, jobs, self.jobs, self.cluster)
         if self.strict and failed:

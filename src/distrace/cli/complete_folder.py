@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import distrace
 from distrace.cli.common import show_table
 from distrace.cli.console import Run, console, progress
 from distrace.data.depth_image import KINDS
@@ -39,18 +40,20 @@ class FolderJob:
 
     path: Path
     command: Command
+    read: tuple[Path, ...] = ()  # other files that the result depends on
 
     @property
     def mark(self) -> str:
-        """Returns a hash of the input and of all options."""
-        digest = hashlib.sha256(repr(self.command).encode())
-        digest.update(self.path.read_bytes())
+        """Returns a hash of the version, of all options, and of the files that are read."""
+        digest = hashlib.sha256(f"{distrace.__version__} {self.command}".encode())
+        for path in (self.path, *self.read):
+            digest.update(path.read_bytes())
         return digest.hexdigest()[:16]
 
     def run(self) -> dict[str, Any]:
         """Returns the row of an input, from an earlier run with the same options or a new one.
 
-        An input that cannot be completed has the verdict `refused` and a reason.
+        An input that cannot be completed has the verdict `refused` and a reason; it is tried again by the next run.
         """
         stored = self.command.out / ROW
         mark = self.mark
@@ -61,11 +64,10 @@ class FolderJob:
         try:
             with redirect_stdout(io.StringIO()), redirect_stderr(io.StringIO()):
                 self.command.run()
-        except (ValueError, MissingLibrary) as error:
-            row = {"input": self.path.name, "verdict": "refused", "reason": str(error)}
-        else:
-            result = json.loads((self.command.out / "result.json").read_text(encoding="utf-8"))
-            row = {"input": self.path.name, **{key: result[key] for key in SHOWN if key in result}}
+        except (ValueError, OSError, RuntimeError, MemoryError, MissingLibrary) as error:
+            return {"input": self.path.name, "verdict": "refused", "reason": str(error)}
+        result = json.loads((self.command.out / "result.json").read_text(encoding="utf-8"))
+        row = {"input": self.path.name, **{key: result[key] for key in SHOWN if key in result}}
         save_json(stored, {"made_by": mark, "row": row})
         return row
 
@@ -82,7 +84,9 @@ def complete_each(run: Run, jobs: Sequence[FolderJob], processes: int | None, cl
     """Completes all inputs and writes one table; returns whether any of them failed or was refused."""
     rows = []
     with progress("completing", len(jobs)) as bar:
-        for row in parallel_map(FolderJob.run, jobs, processes or os.cpu_count() or 1, cluster):
+        if processes is None:
+            processes = 1 if run.device.type == "cuda" else os.cpu_count() or 1
+        for row in parallel_map(FolderJob.run, jobs, processes, cluster):
             rows.append(row)
             bar.advance(f"{row['input']}: {row['verdict']}")
     rows.sort(key=lambda row: row["input"])

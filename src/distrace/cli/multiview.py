@@ -12,7 +12,7 @@ from distrace.checkpoints.colours import colours_of
 from distrace.checkpoints.model import Model
 from distrace.cli.common import Flag, Format, ModelName, Views, check_formats, opened_for, save_meshes
 from distrace.cli.console import console, progress, start
-from distrace.cli.multiview_colours import find_colours, shape_of_silhouettes
+from distrace.cli.multiview_colours import find_colours
 from distrace.coloured import coloured_mesh
 from distrace.data.photo_readers.transforms import save_transforms
 from distrace.data.photographs import Photograph, Photographs, load_photographs, notes
@@ -25,6 +25,7 @@ from distrace.photos.fit_photos import KNOWN_PLACE, UNKNOWN_PLACE, PhotoConfig, 
 from distrace.photos.judge import ViewAgreement, view_agreements
 from distrace.photos.photo_set import PhotoSet
 from distrace.photos.problem import ComparisonConfig, PlacedShape
+from distrace.photos.silhouettes import shape_of_silhouettes
 from distrace.prior import prior_of
 from distrace.report.views_page import colours_beside, forming, views_page
 from distrace.shading import Picture
@@ -40,7 +41,7 @@ class Multiview:
     """Find a shape and its placement from photographs with known cameras.
 
     It needs a model of the object's class. It uses masks where the folder has some. With --fixed a single photograph
-    with a mask is enough.
+    with a mask is enough; there, and with --colour where all have masks, the silhouettes alone tell the shape.
     """
 
     model: tyro.conf.Positional[ModelName]
@@ -75,7 +76,9 @@ class Multiview:
         comparison = replace(usual.comparison, rays=self.rays, same_light=not self.changing_light)
         config = replace(usual, starts=self.starts, seed=self.seed, comparison=comparison)
         colours = colours_of(model, self.model) if self.colour else None
-        fit = shape_of_silhouettes(model, views) if len(views) == 1 and self.fixed else _fitted(model, views, config)
+        masked = all(view.mask is not None for view in views)
+        by_silhouettes = self.fixed and (len(views) == 1 or (self.colour and masked))
+        fit = shape_of_silhouettes(model, views) if by_silhouettes else _fitted(model, views, config)
         last = fit.last
         coloured = None
         albedo = None

@@ -3,7 +3,7 @@
 import math
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -75,14 +75,10 @@ class Train:
             raise ValueError(f"--minutes {self.minutes} was given; it must be finite and above 0")
         saving = Every(self.save_every)
         check_log(self.log)
-        if self.colour and self.begin_with is None:
-            raise ValueError("--colour was given without --begin-with, which names the model to add colours to")
-        run = start(self.out, self.device)
-        if self.colour and self.begin_with is not None:
-            with run_lock(run.out), flushed_denormals(), run.noticing():
-                config = replace(ColourTrainConfig(), **_given(self, "steps", "seed"))
-                train_colours(run, self.samples, self.split, self.begin_with, config)
+        if self.colour:
+            self._colours()
             return
+        run = start(self.out, self.device)
         with joined(run.device) as (processes, run.device), flushed_denormals(), ExitStack() as stack:
             processes.from_leader(lambda: stack.enter_context(run_lock(run.out)))
             stack.enter_context(run.noticing())
@@ -90,6 +86,20 @@ class Train:
                 console.quiet = True
                 warnings.simplefilter("ignore")
             self._train(run, processes, saving)
+
+    def _colours(self) -> None:
+        """Trains colours. Raises `ValueError` without a model, and for options that they do not use."""
+        if self.begin_with is None:
+            raise ValueError("--colour was given without --begin-with, which names the model to add colours to")
+        used = ("samples", "out", "split", "begin_with", "colour", "steps", "seed", "device")
+        for field in fields(self):
+            if field.name not in used and getattr(self, field.name) != field.default:
+                option = field.name.replace("_", "-")
+                raise ValueError(f"--{option} was given, which --colour does not use; leave it out")
+        run = start(self.out, self.device)
+        with run_lock(run.out), flushed_denormals(), run.noticing():
+            config = replace(ColourTrainConfig(), **_given(self, "steps", "seed"))
+            train_colours(run, self.samples, self.split, self.begin_with, config)
 
     def _train(self, run: Run, processes: Processes, saving: Every) -> None:
         samples = self._samples(run, processes)

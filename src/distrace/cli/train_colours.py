@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 
 from distrace.checkpoints.colours import Colours, save_colours
-from distrace.checkpoints.model import Model, load_model, save_model
+from distrace.checkpoints.model import Model, load_model, model_folder, save_model
 from distrace.cli.common import Orbit
 from distrace.cli.console import Run, console, progress
 from distrace.coloured import coloured_picture, studio
@@ -32,6 +32,7 @@ def train_colours(run: Run, meshes: Path, splits: Sequence[Path], name: str, con
     `meshes` holds the textured meshes of its shapes. Raises `ValueError` where none has a shape's name.
     """
     model = load_model(name)
+    _check_folder(run.out, name)
     config = replace(config, specs=replace(config.specs, shape_code=model.codes.shape[1]))
     chosen = _shapes(model, meshes, splits)
     samples = _sampled(colour_jobs(chosen, meshes, run.out / "coloured-points", POINTS))
@@ -40,9 +41,9 @@ def train_colours(run: Run, meshes: Path, splits: Sequence[Path], name: str, con
     training = start_colours(len(shapes), config, run.device)
     loss = math.nan
     with progress("training colours", config.steps) as bar:
-        for step in trained_steps(training, list(samples.values()), codes, config):
-            loss = step.loss if math.isnan(loss) else 0.98 * loss + 0.02 * step.loss
-            bar.advance(f"loss {loss:.4f}", to=step.step)
+        for latest in trained_steps(training, list(samples.values()), codes, config):
+            loss = latest if math.isnan(loss) else 0.98 * loss + 0.02 * latest
+            bar.advance(f"loss {loss:.4f}")
     colours = _ordered(training, shapes, config)
     save_model(run.out, model)
     network = load_placement_network(name)
@@ -51,6 +52,15 @@ def train_colours(run: Run, meshes: Path, splits: Sequence[Path], name: str, con
     save_colours(run.out, colours)
     save_png(run.out / "preview.png", side_by_side(_previews(model.to(run.device), colours)))
     run.finish({"steps": config.steps, "loss": loss, "shapes": len(shapes)})
+
+
+def _check_folder(out: Path, name: str) -> None:
+    """Raises `ValueError` where the model would be written over another one."""
+    if out.resolve() == model_folder(name).resolve():
+        raise ValueError(f"--out {out} is the folder of --begin-with {name}; give another")
+    for other in ("checkpoint.pt", "ModelParameters"):
+        if (out / other).exists():
+            raise ValueError(f"--out {out} holds a run of `train` without --colour; give another folder")
 
 
 def _shapes(model: Model, meshes: Path, splits: Sequence[Path]) -> list[Shape]:

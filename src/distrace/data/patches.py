@@ -83,11 +83,14 @@ def _of_trimesh(path: Path) -> list[Patch]:
 
 
 def _of_geometry(mesh: Any) -> Patch:
+    corners = np.asarray(mesh.triangles, np.float64)
+    if mesh.visual.kind == "vertex":
+        colours = np.asarray(mesh.visual.vertex_colors)[:, :3] / 255
+        return Patch(corners, np.zeros((*corners.shape[:2], 2)), colours[mesh.faces])
     material = getattr(mesh.visual, "material", None)
     uv = getattr(mesh.visual, "uv", None)
     colour = GREY if material is None else np.asarray(material.main_color[:3]) / 255
-    image = getattr(material, "image", None)
-    corners = np.asarray(mesh.triangles, np.float64)
+    image = getattr(material, "image", None) or getattr(material, "baseColorTexture", None)  # of OBJ, of GLB
     if uv is None or image is None:
         return _patch(corners, np.zeros((*corners.shape[:2], 2)), colour, None)
     return _patch(corners, np.asarray(uv)[mesh.faces], colour, _pixels(image))

@@ -16,10 +16,11 @@ from distrace.lights import HARMONICS, SphericalHarmonics, white_in_harmonics
 from distrace.pose import Similarity
 from distrace.render import render
 
-CANDIDATES = 64  # training palettes that are compared before the fit
+CANDIDATES = 64  # training palettes (colours of a whole shape) that are compared before the fit
 CANDIDATE_POINTS = 400
+LARGEST = 256  # pixels along the longer side of photographs: a step compares a thousand points
 RIDGE = 0.03  # of the light's coefficients in that comparison, for each point
-USUAL_BRIGHTNESS = 0.7  # of a white surface in a photograph: colours alone do not tell it
+USUAL_BRIGHTNESS = 0.7  # of a white surface in a photograph: brightness and albedo are ambiguous
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def fit_colours(
         tint = (light - light.mean(-1, keepdim=True)).square().mean()
         loss = (to_srgb(albedo * brightness) - part.colours).abs().mean()
         loss = loss + config.code_weight * colour.square().mean() + config.tint_weight * tint
-        loss = loss + config.brightness_weight * _unusual(brightness)
+        loss = loss + config.brightness_weight * _brightness_prior(brightness)
         adam.zero_grad()
         loss.backward()
         adam.step()
@@ -89,7 +90,7 @@ def fit_colours(
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Samples:
     """Points of a surface in the object's frame, and what the photographs show there."""
 
     points: Float[Tensor, "n 3"]
@@ -98,24 +99,27 @@ class _Seen:
     colours: Float[Tensor, "n 3"]  # sRGB
     view: Int[Tensor, "n"]
 
-    def drawn(self, count: int, random: torch.Generator) -> "_Seen":
+    def drawn(self, count: int, random: torch.Generator) -> "_Samples":
         """Returns some of the points, or all where there are fewer."""
         rows = torch.randperm(len(self.points), generator=random)[:count].to(self.points.device)
-        return _Seen(self.points[rows], self.normals[rows], self.white[rows], self.colours[rows], self.view[rows])
+        return _Samples(self.points[rows], self.normals[rows], self.white[rows], self.colours[rows], self.view[rows])
 
 
 @torch.no_grad()
-def _seen_surface(photographs: Sequence[Photograph], sdf: SDF, place: Similarity) -> _Seen:
+def _seen_surface(photographs: Sequence[Photograph], sdf: SDF, place: Similarity) -> _Samples:
     """Returns all points of a shape that the photographs show; masks, where they are known, leave out what hides it."""
     parts = []
-    for number, view in enumerate(photographs):
-        buffers = render(sdf, place.camera_in_object(view.camera))
+    occupancy = None
+    for number, full in enumerate(photographs):
+        view = full.at_most(LARGEST)
+        buffers = render(sdf, place.camera_in_object(view.camera), occupancy=occupancy)
+        occupancy = buffers.occupancy
         shown = buffers.mask if view.mask is None else buffers.mask & view.mask
         normals = buffers.normal[shown]
         white = white_in_harmonics(place.turned(normals))
         views = torch.full((len(normals),), number, device=normals.device)
-        parts.append(_Seen(buffers.points[shown[buffers.mask]], normals, white, view.image[shown], views))
-    seen = _Seen(*(torch.cat([getattr(part, name) for part in parts]) for name in _Seen.__dataclass_fields__))
+        parts.append(_Samples(buffers.points[shown[buffers.mask]], normals, white, view.image[shown], views))
+    seen = _Samples(*(torch.cat([getattr(part, name) for part in parts]) for name in _Samples.__dataclass_fields__))
     if not len(seen.points):
         raise ValueError("no photograph shows the shape; its colours cannot be found")
     return seen
@@ -123,7 +127,11 @@ def _seen_surface(photographs: Sequence[Photograph], sdf: SDF, place: Similarity
 
 @torch.no_grad()
 def _best_palette(
-    colours: Colours, seen: _Seen, code: Float[Tensor, "length"], config: ColourFitConfig, random: torch.Generator
+    colours: Colours,
+    seen: _Samples,
+    code: Float[Tensor, "length"],
+    config: ColourFitConfig,
+    random: torch.Generator,
 ) -> tuple[Float[Tensor, "colour"], Float[Tensor, "9 3"]]:
     """Returns the training palette, or their mean, and the light that explain the colours best."""
     part = seen.drawn(CANDIDATE_POINTS, random)
@@ -137,12 +145,12 @@ def _best_palette(
         brightness = part.white @ light
         loss = (to_srgb(albedo * brightness) - part.colours).abs().mean()
         found.append(light)
-        losses.append(loss + config.brightness_weight * _unusual(brightness))
+        losses.append(loss + config.brightness_weight * _brightness_prior(brightness))
     best = int(torch.stack(losses).argmin())
     return candidates[best], found[best]
 
 
-def _unusual(brightness: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
+def _brightness_prior(brightness: Float[Tensor, "n 3"]) -> Float[Tensor, ""]:
     """Returns the squared logarithm of how much brighter or darker white would be than in most photographs."""
     return (brightness.mean().clamp_min(0.01) / USUAL_BRIGHTNESS).log().square()
 

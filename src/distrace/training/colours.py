@@ -4,9 +4,8 @@ A few shapes have a few colours. So each material also gets colours at random, a
 """
 
 import colorsys
-import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -43,16 +42,6 @@ class ColourTraining:
 
     decoder: ColourDecoder
     codes: nn.Parameter  # [shapes × palettes, length]
-    losses: list[float] = field(default_factory=list)
-
-
-@dataclass(frozen=True)
-class ColourStep:
-    """One step done."""
-
-    step: int
-    loss: float
-    seconds: float
 
 
 def start_colours(shapes: int, config: ColourTrainConfig, device: torch.device) -> ColourTraining:
@@ -68,8 +57,8 @@ def train_colours(
     samples: Sequence[ColouredPoints],
     shape_codes: Float[Tensor, "shapes length"],
     config: ColourTrainConfig,
-) -> Iterator[ColourStep]:
-    """Trains in place on the mean absolute difference of sRGB colours, and yields after every step."""
+) -> Iterator[float]:
+    """Trains in place on the mean absolute difference of sRGB colours, and yields the loss of every step."""
     device = training.codes.device
     points = [torch.from_numpy(np.concatenate([each.points, each.normals], axis=1)).to(device) for each in samples]
     colours = [_in_palettes(each, config, number).to(device) for number, each in enumerate(samples)]
@@ -77,7 +66,6 @@ def train_colours(
     optimiser = torch.optim.Adam(groups)
     random = torch.Generator().manual_seed(config.seed)
     for step in range(config.steps):
-        began = time.perf_counter()
         fall = 0.5 + 0.5 * float(np.cos(np.pi * step / config.steps))
         optimiser.param_groups[0]["lr"] = fall * config.learning_rate
         optimiser.param_groups[1]["lr"] = fall * config.code_learning_rate
@@ -90,7 +78,7 @@ def train_colours(
         optimiser.zero_grad()
         (loss + config.code_penalty * codes.square().mean()).backward()
         optimiser.step()
-        yield ColourStep(step + 1, loss.item(), time.perf_counter() - began)
+        yield loss.item()
 
 
 def _batch(
