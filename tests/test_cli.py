@@ -643,7 +643,6 @@ BAD = [
     ("complete {model} {tmp}/missing.ply", "missing.ply does not exist"),
     ("complete {model} {view} --plausible -1", "--plausible -1"),
     ("complete {model} {tmp}/empty", "empty is not an observation"),
-    ("complete {model} {tmp}", "is not an observation"),
     ("complete {model} {view} --points 0", "--points 0"),
     ("complete {model} {view} --iterations 0", "0 iterations"),
     ("complete {model} {view} --starts 0", "0 starts"),

@@ -85,14 +85,13 @@ def test_a_folder_takes_no_mask(tmp_path: Path) -> None:
         Complete("sofas", (tmp_path,), tmp_path / "out", mask=tmp_path / "mask.png").run()
 
 
-def test_a_command_completes_what_it_can_and_lists_the_rest(tmp_path: Path) -> None:
+def test_where_nothing_can_be_completed_the_command_lists_why(tmp_path: Path) -> None:
     folder = tmp_path / "scans"
     folder.mkdir()
     (folder / "a.xyz").write_text("0 0 0\n")
     (folder / "b.npz").write_bytes(b"nothing")
-    with pytest.raises(SystemExit) as status:
-        Complete("sofas", (folder,), tmp_path / "out", strict=True, jobs=1).run()
-    assert status.value.code == 3
+    with pytest.raises(ValueError, match="none of the 2 inputs could be completed"):
+        Complete("sofas", (folder,), tmp_path / "out", jobs=1).run()
     rows = json.loads((tmp_path / "out" / "result.json").read_text())["rows"]
     assert [(row["input"], row["verdict"]) for row in rows] == [("a.xyz", "refused"), ("b.npz", "refused")]
     assert "1 points of the object are known" in rows[0]["reason"]

@@ -110,7 +110,7 @@ def test_only_images_with_something_on_them_count(tmp_path: Path) -> None:
 def test_a_painted_patch_covers_the_same_surface_in_colours_that_vary(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("experiments.clips.patches.EDGE", 0.05)
+    monkeypatch.setattr("experiments.clips.mottled_patches.EDGE", 0.05)
     (patch,) = placed(load_patches(stored(tmp_path, image=False)), 0.0)
     fine = mottled_patch(patch, 3)
     assert fine.area == pytest.approx(patch.area)

@@ -101,7 +101,7 @@ def small_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     """Trials of small views, in this process: others do not know that they are to be small."""
     for module in (depth, spread):
         monkeypatch.setattr(
-            module, "parallel_map", lambda work, wanted, jobs: map(pickle.loads(pickle.dumps(work)), wanted)
+            module, "parallel_map", lambda work, wanted, jobs, cluster: map(pickle.loads(pickle.dumps(work)), wanted)
         )
     monkeypatch.setattr(sparse_depth, "SIZE", 64)
     monkeypatch.setattr(spread, "MeshConfig", partial(MeshConfig, 32))

@@ -91,7 +91,8 @@ def named_albedo(model: Model, source: str | Path, shape: str, code: Float[Tenso
     `own` are those of the shape, by its number or name; otherwise those of another training shape, or of a `colour.npy`
     that a command wrote. Raises `ValueError`, in one sentence, for anything else.
     """
-    colours = colours_of(model, source)
+    with error_context(f"--colour {given} was given"):
+        colours = colours_of(model, source)
     if given.endswith(".npy"):
         colour = _read_code(Path(given), colours)
     else:

@@ -95,4 +95,6 @@ def complete_each(run: Run, jobs: Sequence[FolderJob], processes: int | None, cl
         if row["verdict"] == "refused":
             console.print(f"{row['input']} is left out: {row['reason']}")
     run.finish({"rows": rows, "inputs": len(rows)})
+    if all(row["verdict"] == "refused" for row in rows):
+        raise ValueError(f"none of the {len(rows)} inputs could be completed; the lines above say why")
     return any(row["verdict"] in ("failed", "refused") for row in rows)

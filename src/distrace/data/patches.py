@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
-from PIL import Image
 
 from distrace.data.ac3d import Surfaces, load_surfaces
 from distrace.data.solid import bounding, normalised_frame, turn_matrix
@@ -111,6 +110,8 @@ def _joined(parts: Sequence[Surfaces]) -> Surfaces:
 
 
 def _of_surfaces(surfaces: Surfaces, colours: Float[np.ndarray, "materials 3"], folder: Path) -> Iterator[Patch]:
+    from PIL import Image
+
     file = folder / surfaces.image
     if surfaces.image and file.is_file():
         yield _patch(surfaces.corners, surfaces.uv, GREY, _pixels(Image.open(file)))
