@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, UInt8
 
 from distrace.camera import Camera
+from distrace.colour_space import to_linear
 from distrace.data.patches import Patch
 from distrace.lights import Ambient, Directional, Light
 from distrace.shading import Picture
@@ -134,8 +136,7 @@ def _reflectance(patch: Patch) -> dict[str, Any]:
 
 
 def _linear(colours: Float[np.ndarray, "*colours 3"]) -> Float[np.ndarray, "*colours 3"]:
-    """Converts from sRGB (IEC 61966-2-1)."""
-    return np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    return to_linear(torch.from_numpy(np.array(colours, np.float64))).numpy()
 
 
 def _grey() -> dict[str, Any]:

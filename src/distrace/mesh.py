@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from distrace.colour_space import to_linear
 from distrace.errors import DoubtfulResult
 from distrace.fields.base import SDF, check_field, chunked, evaluate_checked, pruned
 from distrace.fields.lipschitz import percentile_99, typical_slope
@@ -113,8 +114,7 @@ def save_mesh(path: Path, mesh: "trimesh.Trimesh") -> None:
 
 def _in_linear_light(colours: UInt8[np.ndarray, "n 4"]) -> UInt8[np.ndarray, "n 4"]:
     """Returns sRGB colours in linear light (IEC 61966-2-1); the fourth column, the opacity, is linear already."""
-    srgb = colours[:, :3] / 255
-    light = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    light = to_linear(torch.from_numpy(colours[:, :3] / 255)).numpy()
     return np.hstack([np.rint(255 * light).astype(np.uint8), colours[:, 3:]])
 
 

@@ -23,11 +23,19 @@ def named_code(model: Model, given: str) -> Float[Tensor, "length"]:
     if not given.endswith(".npy"):
         with error_context(f"{given} is neither the number nor the name of a training shape, nor a code.npy"):
             return model.code_of(given)
-    with error_context(f"{given} is no code that a command wrote", Path(given)):
-        code = torch.from_numpy(np.load(given, allow_pickle=False)).to(model.codes)
-        if code.shape != model.codes.shape[1:]:
-            length = model.codes.shape[1]
-            raise ValueError(f"it has the shape {list(code.shape)}, and codes of {model.name} have {length} values")
+    return read_code(Path(given), model.codes, model.name)
+
+
+def read_code(path: Path, codes: Float[Tensor, "n length"], model: str) -> Float[Tensor, "length"]:
+    """Returns a code from a file that a command wrote, as long as a model's `codes` and on their device.
+
+    Raises `ValueError`, in one sentence, for anything else.
+    """
+    with error_context(f"{path} is no code that a command wrote", path):
+        code = torch.from_numpy(np.load(path, allow_pickle=False)).to(codes)
+        if code.shape != codes.shape[1:]:
+            length = codes.shape[1]
+            raise ValueError(f"it has the shape {list(code.shape)}, and codes of {model} have {length} values")
         if not code.isfinite().all():
             raise ValueError("it has values that are not finite")
     return code

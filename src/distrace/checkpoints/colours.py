@@ -4,12 +4,12 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 import safetensors.torch
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from distrace.checkpoints.codes import read_code
 from distrace.checkpoints.model import Model, model_folder
 from distrace.errors import error_context
 from distrace.fields.colour import Albedo, ColourDecoder, ColourSpecs
@@ -94,20 +94,10 @@ def named_albedo(model: Model, source: str | Path, shape: str, code: Float[Tenso
     with error_context(f"--colour {given} was given"):
         colours = colours_of(model, source)
     if given.endswith(".npy"):
-        colour = _read_code(Path(given), colours)
+        colour = read_code(Path(given), colours.codes, f"the colours of {model.name}")
     else:
         name = shape if given == "own" else given
         name = model.shapes[int(name)] if name.isdecimal() and int(name) < len(model.shapes) else name
         with error_context(f"--colour {given} was given"):
             colour = colours.code_of(name)
     return colours.decoder.albedo(code, colour)
-
-
-def _read_code(path: Path, colours: Colours) -> Float[Tensor, "length"]:
-    with error_context(f"{path} is no colour code that a command wrote", path):
-        colour = torch.from_numpy(np.load(path, allow_pickle=False)).to(colours.codes)
-        if colour.shape != colours.codes.shape[1:]:
-            raise ValueError(f"it has the shape {list(colour.shape)}; codes have {colours.codes.shape[1]} values")
-        if not colour.isfinite().all():
-            raise ValueError("it has values that are not finite")
-    return colour
